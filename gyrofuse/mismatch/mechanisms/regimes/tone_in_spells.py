@@ -18,6 +18,7 @@ from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
 from gyrofuse.mismatch.mechanisms.regimes.transient import Transient, kept_of
 from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
 from gyrofuse.mismatch.signals.comparison import Comparison
+from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.stats.inclusion import included_sensors
 from gyrofuse.mismatch.stats.limits import Z
@@ -203,10 +204,7 @@ def _spells(comparison: Comparison, frequency: float, noise: Tensor) -> list[tup
     """
     n, most, block = comparison.n_samples, 24, _block(comparison, frequency)
     z = _of_blocks(comparison, frequency, noise)
-    gains = torch.linalg.eigh(z @ z.mH).eigenvectors[:, -1]
-    along = gains.conj() @ z  # (block,), of noise of variance one
-    power = along.abs().square()
-    on = _on(power)
+    on = _on((_gains(z) @ z).abs().square())
     if not bool(on.any()) or bool(on.all()):
         return []
     edges = torch.nn.functional.pad(on.to(torch.int8), (1, 1)).diff().nonzero()[:, 0].tolist()
@@ -227,6 +225,11 @@ def _of_blocks(comparison: Comparison, frequency: float, noise: Tensor) -> Tenso
     return turned.sum(-1) / (block * noise).sqrt()[:, None]
 
 
+def _gains(z: Tensor) -> Tensor:
+    """Weights of the sensors `(sensor,)` along which amplitudes `(sensor, block)` have most power."""
+    return torch.linalg.eigh(z @ z.mH).eigenvectors[:, -1].conj()
+
+
 def _steady(
     comparison: Comparison, effect: ToneInSpells, spells: list[tuple[int, int]], frequency: float, noise: Tensor
 ) -> bool:
@@ -234,7 +237,7 @@ def _steady(
     share, block = 1 / 7, _block(comparison, frequency)
     left = comparison.subtract(effect.path(comparison.n_samples, comparison.info.rate))
     z, rest = (_of_blocks(one, frequency, noise) for one in (comparison, left))
-    gains = torch.linalg.eigh(z @ z.mH).eigenvectors[:, -1].conj()
+    gains = _gains(z)
     before, after = ((gains @ one).abs().square() for one in (z, rest))  # of noise of variance one
     start = block * torch.arange(len(before))
     on = torch.stack([(start >= a) & (start + block <= b) for a, b in spells]).any(0)
@@ -295,11 +298,17 @@ def _noise_near(comparison: Comparison, frequency: float) -> Tensor:
     It starts or stops in few of them; in the spectrum of the whole it would be its own noise.
     """
     gap, reach = 3, 12  # bins of a part
-    powers = _powers_of_parts(comparison, 1)
+    powers = _unpadded_powers(comparison)
     place = torch.arange(powers.shape[-1], dtype=torch.float64) / (2 * (powers.shape[-1] - 1))
     away = (place - frequency).abs() / place[1]
     near = (away > gap) & (away <= reach) & (place > 0)
     return powers[..., near].flatten(1).median(-1).values / math.log(2)
+
+
+@derived
+def _unpadded_powers(comparison: Comparison) -> Tensor:
+    """For the noise near each of the spells, and of the folds."""
+    return _powers_of_parts(comparison, 1)
 
 
 def _powers_of_parts(comparison: Comparison, padding: int) -> Tensor:
