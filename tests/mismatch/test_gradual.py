@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 
 import numpy as np
 import pytest
@@ -113,6 +114,9 @@ def test_a_ramp_is_all_that_differs(depth: float):
     model = gf.WhiteNoise(1.0) + gf.AR1(0.98, 0.004) + gf.RandomWalk(1e-5)
     report = gf.diagnose(gf.Recording(comparison.recording, rate=RATE, unit="deg/s"), model)
     assert [f.mechanism for f in report.findings] == ["variance_change"]
+    said = re.search(r"to (\S+) times what it was", report.findings[0].sentence)
+    assert said is not None
+    assert float(said[1]) == pytest.approx(math.exp(depth), rel=0.4)
     assert report.unexplained == ()
     assert report.held_out.after < 1.5
 

@@ -2,8 +2,9 @@
 
     x_i(t) = exp(-(t - t0) / tau) [cosine_i cos(2 pi f (t - t0)) + sine_i sin(2 pi f (t - t0))],   t >= t0,
 
-Samples and tones are whitened by the simulation's spectra; the level of the noise is that of the samples themselves, so
-that the log likelihood ratio of a sensor is `m/2 log(RSS0 / RSS)` for `m` samples.
+Samples and tones are whitened by the simulation's spectra, times what octaves of the noise before and after have over
+them; the level of the noise is that of the samples themselves, so that the log likelihood ratio of a sensor is
+`m/2 log(RSS0 / RSS)` for `m` samples.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 from scipy import optimize
 from torch import Tensor
 
+from gyrofuse.mismatch.likelihoods.noise_near import noise_around
 from gyrofuse.mismatch.signals.lines import with_factors
 from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum
 
@@ -71,12 +73,14 @@ class Surroundings:
         base: Noise of the simulation.
         first: Position of the first sample.
         samples: `(sensor, time)`.
+        near: Density of the noise near them over the simulation's, from 0 to half the rate, `(sensor, bin)`.
         keep: Those to be used, `(time,)`; all by default.
     """
 
     base: NoiseSpectrum
     first: int
     samples: Tensor
+    near: Tensor
     keep: Tensor | None = None
 
     @classmethod
@@ -84,7 +88,7 @@ class Surroundings:
         """Of a recording `(sensor, time)`, as far as it goes."""
         before, after = (round(times * tau) + 64 for times in (6, 10))  # where it is not yet, and no more
         first, end = max(onset - before, 0), min(onset + after, recording.shape[-1])
-        return cls(base, first, recording[:, first:end])
+        return cls(base, first, recording[:, first:end], noise_around(recording, base, onset, tau))
 
     def without(self, turn: int, of: int) -> Surroundings:
         """Without every so many-th sample, to be judged by."""
@@ -98,7 +102,9 @@ class Surroundings:
     @cached_property
     def _factors(self) -> Tensor:
         """What whitens cosine ordinates, `(sensor, ordinate)`: the same for all paths that are tried."""
-        return self.base.of_ordinates(self.samples.shape[-1]).rsqrt()
+        n = self.samples.shape[-1]
+        near = torch.nn.functional.interpolate(self.near[:, None], n, mode="linear", align_corners=True)[:, 0]
+        return (self.base.of_ordinates(n) * near).rsqrt()
 
     def whitened_paths(self, paths: Tensor) -> Tensor:
         """Paths `(path, time)` as each sensor's whitened samples show them, `(sensor, path, time)`."""

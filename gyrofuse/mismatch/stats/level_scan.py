@@ -140,3 +140,19 @@ def local_level(values: Tensor) -> Tensor:
         total = pad(squares.minimum(9.0 * level).cumsum(-1), (1, 0))
         level = ((total[..., high] - total[..., low]) / (high - low)).clamp(min=1e-300)
     return level / level.mean(-1, keepdim=True)
+
+
+def octave_level(power: Tensor, first: int) -> Tensor:
+    """Level of noise near each bin, `(..., 1, bin)`: the median of its octave, over all frames `(..., frame, bin)`.
+
+    In units of the mean of exponential values. Octaves have eight bins at least, from the first one on; a tone is in
+    few of them.
+    """
+    n = power.shape[-1]
+    level, low, width = torch.ones_like(power[..., :1, :]), first, 8
+    while low < n:
+        high = low + width if low + 2 * width <= n else n
+        octave = power[..., low:high].flatten(-2).median(-1).values / math.log(2)
+        level[..., low:high] = octave[..., None, None].clamp(min=1e-30)
+        low, width = high, max(high, 8)
+    return level

@@ -2,8 +2,9 @@
 
 Whitened records of a steady level are seen through windows that begin at once and decay as `exp(-t / tau)`, for `tau`
 from 8 samples on in octaves. Powers `v` of cells of time and frequency are over the median of all times of their
-frequency, so that a line or a resonance that is there all the time does not count; of noise they are exponential. A
-ring-down whose power is `a` times that of the noise has the likelihood ratio
+frequency, so that a line or a resonance that is there all the time does not count, and over the median of their octave
+at about that time, so that slow noise does not where fast noise is quieter; of noise they are exponential. A ring-down
+whose power is `a` times that of the noise has the likelihood ratio
 
     exp(a / (1 + a) v) / (1 + a)
 
@@ -25,7 +26,7 @@ from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
-from gyrofuse.mismatch.stats.level_scan import local_level
+from gyrofuse.mismatch.stats.level_scan import local_level, octave_level
 from gyrofuse.mismatch.stats.multiplicity import e_value_of_some, p_value_beyond_reference
 
 
@@ -153,7 +154,7 @@ class _Part(NamedTuple):
 
 def _powers(white: Tensor, tau: int) -> Iterator[_Part]:
     """Windows `exp(-t / tau)` over whitened samples, two for a time constant, some at a time to bound memory."""
-    reach, most_for_median, numbers_at_once, leaks = 4, 512, 4_000_000, 1.6
+    reach, most_for_median, numbers_at_once, leaks, local = 4, 512, 4_000_000, 1.6, 48
     length, hop = reach * tau, tau // 2
     lowest = reach  # a cycle for a time constant: what is slower is a step or a drift
     taper = torch.exp(-torch.arange(length, dtype=white.dtype) / tau)
@@ -172,9 +173,13 @@ def _powers(white: Tensor, tau: int) -> Iterator[_Part]:
     own = middle(smooth / smooth.norm())
     # A window that begins at once leaks: where a filter holds nearly all back its first sample is all the power.
     usual = torch.where((usual := middle(taper)) < leaks * own, usual, torch.inf)
-    at_once = max(numbers_at_once // (length * len(white)), 1)
-    for a in range(0, frames.shape[1], at_once):
-        yield _Part(power(frames[:, a : a + at_once], taper) / usual, a * hop, hop, lowest, tau, length)
+    at_once, first = max(numbers_at_once // (length * len(white)), local), 0
+    for some in frames.tensor_split(max(frames.shape[1] // at_once, 1), 1):
+        over = power(some, taper) / usual
+        for stretch in over.tensor_split(max(over.shape[1] // local, 1), 1):
+            stretch /= octave_level(stretch, 0)
+        yield _Part(over, first, hop, lowest, tau, length)
+        first += hop * some.shape[1]
 
 
 def _log_ratios(score: Tensor) -> Tensor:

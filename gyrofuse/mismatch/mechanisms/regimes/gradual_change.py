@@ -105,7 +105,8 @@ class GradualChange(ChangingVariance):
         effect = cls(knots / rate, share[knots], base, factor, corner * rate)
         sensors = tuple((factor != 1).nonzero()[:, 0].tolist())
         reach = Z * course.log_factor_sd
-        parameters, way = {}, _Way.of(course.share, rate)
+        rises = float(share[peak].mean()) > float(share[~peak].mean())
+        parameters, way = {}, _Way.of(course.share if rises else 1 - course.share, rate)
         for i in sensors:
             value, spread = float(factor[i]), math.exp(float(reach[i]))
             parameters[f"factor[{i}]"] = Parameter(value, value / spread, value * spread, "")

@@ -7,11 +7,11 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.likelihoods.noise_near import noise_along
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED
 from gyrofuse.mismatch.signals.lines import whitened
-from gyrofuse.mismatch.signals.prediction_errors import median_sd
 
 
 class Transient(Mechanism):
@@ -39,10 +39,11 @@ class Transient(Mechanism):
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
         n, white = comparison.n_samples, comparison.white
         taken = whitened(self.path(n, comparison.info.rate), comparison.base)
-        variance = median_sd(white - taken)[:, None].square()
-        gains = ((white * taken - taken.square() / 2) / variance).sum(0) * ~kept_of(n, fold)
+        gains = (white * taken - taken.square() / 2) * ~kept_of(n, fold)
         block = n // N_JUDGED
-        return gains[: N_JUDGED * block].view(N_JUDGED // N_FOLDS, -1).sum(-1)
+        of_blocks = gains[:, : N_JUDGED * block].unflatten(-1, (N_JUDGED, block)).sum(-1)
+        scores = (of_blocks / noise_along(taken, white - taken).clamp(min=1e-300)).sum(0)
+        return scores.view(N_JUDGED // N_FOLDS, N_FOLDS).sum(-1)
 
     def remove(self, signal: Tensor, info: RecordingInfo) -> Tensor:
         return signal - self.path(signal.shape[-1], info.rate)
