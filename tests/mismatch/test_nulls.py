@@ -380,7 +380,9 @@ def test_a_steep_filter_makes_no_outliers_and_changes_no_level(taps, n: int):
     assert noise_level.variance_test(given).p_value > LEVEL
 
 
-@pytest.mark.parametrize("form", ["pole", "butterworth", "steep", "low", "average", "triangle", "windowed"])
+@pytest.mark.parametrize(
+    "form", ["pole", "butterworth", "steep", "low", "average", "triangle", "windowed", "high", "band", "difference"]
+)
 def test_what_a_filter_leaves_alike_on_both_sides_is_no_mismatch(form: str):
     """Stop bands and zeros that recording and simulation share: leakage, few ordinates and ends are no evidence."""
     numerator, denominator = {
@@ -391,6 +393,9 @@ def test_what_a_filter_leaves_alike_on_both_sides_is_no_mismatch(form: str):
         "average": (np.ones(4) / 4, [1.0]),
         "triangle": (np.array([1.0, 2.0, 3.0, 2.0, 1.0]) / 9, [1.0]),
         "windowed": (signal.firwin(31, 0.4), [1.0]),
+        "high": butter(2, 0.04, "high"),
+        "band": butter(2, (0.1, 0.4), "band"),
+        "difference": ([1.0, -1.0], [1.0]),
     }[form]
     alarms = 0
     for seed in range(6):

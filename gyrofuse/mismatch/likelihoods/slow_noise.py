@@ -30,7 +30,9 @@ from torch import Tensor
 from gyrofuse._base.nnls import nonnegative_least_squares
 from gyrofuse._base.transforms import squared_modulus
 from gyrofuse.mismatch.signals.comparison import N_BLOCKS, Comparison, block_means
-from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum, ar1_time_constants, atom_covariances
+from gyrofuse.mismatch.signals.derived import derived
+from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum, ar1_time_constants, atom_covariances, let_in
+from gyrofuse.mismatch.signals.records import Records
 from gyrofuse.mismatch.stats.gls import least_squares
 
 _PRIOR_SD = 0.35  # of log variances of the simulation's own parts, however long it is: a factor of 1.4
@@ -145,7 +147,7 @@ def slow_powers(comparison: Comparison) -> SlowPowers:
     known = side.dof > 0
     every_atom = torch.eye(len(ar1_time_constants(n)) + 3, dtype=torch.float64)  # white, quantisation, AR1s, a walk
     return SlowPowers(
-        torch.cat([side.power[:, known], slow_ordinates(side.steady)[..., :_UNSEEN].square().mean(0)], -1),
+        torch.cat([side.power[:, known], _simulated_ordinates(comparison)[..., :_UNSEEN].square().mean(0)], -1),
         torch.cat(
             [
                 bands.mean_of(NoiseSpectrum(n, every_atom).spectrum(bands.nodes))[:, known],
@@ -261,6 +263,39 @@ def ordinates(means: Tensor) -> Tensor:
 def slow_ordinates(signal: Tensor) -> Tensor:
     """Cosine ordinates of the block means of signals, `(..., time)` -> `(..., ordinate)`."""
     return ordinates(block_means(signal))
+
+
+def recorded_ordinates(comparison: Comparison) -> Tensor:
+    """Of the recording, `(sensor, ordinate)`, without what its ends let in where the simulation has little else."""
+    y = slow_ordinates(comparison.observed.steady[0])
+    return _without_ends(y) if _ends_let_in(comparison.reference) else y
+
+
+def _simulated_ordinates(comparison: Comparison) -> Tensor:
+    """Likewise of the simulation, `(record, sensor, ordinate)`."""
+    y = slow_ordinates(comparison.reference.steady)
+    return _without_ends(y) if _ends_let_in(comparison.reference) else y
+
+
+@derived
+def _ends_let_in(side: Records) -> bool:
+    """Whether what the ends let in is most of the slowest ordinates, as after a high-pass: the same two numbers."""
+    most, n = 3, side.bands.n_samples
+    at = torch.arange(1, _UNSEEN + 1, dtype=torch.float64) / (2 * n)
+    f = torch.logspace(-math.log10(2 * n), math.log10(0.5), 1000, dtype=torch.float64)
+    own = side.density(at)
+    return bool((let_in(f, side.density(f), at, n).sum(-1) > most * own.sum(-1)).any())
+
+
+def _without_ends(y: Tensor) -> Tensor:
+    """Ordinates `(..., ordinate)` without what the first and the last block have beyond their neighbours.
+
+    By least squares in the slowest ordinates, in which nothing else is as large.
+    """
+    ends = cosines()[:, [0, -1]]  # (ordinate, end)
+    low = ends[:_UNSEEN]
+    size = torch.linalg.solve(low.mT @ low, low.mT @ y[..., :_UNSEEN, None])
+    return y - (ends @ size)[..., 0]
 
 
 def cosines() -> Tensor:

@@ -51,11 +51,12 @@ class NoiseSpectrum:
         """Variances of the cosine ordinates of a record of `n` samples, `(sensor, ordinate)`.
 
         Where noise has next to nothing slow, as after a high-pass, most of the slow ones is what the record's ends let
-        in.
+        in. It is the same two numbers in all of them: the more it is, the less they count.
         """
         f = (torch.arange(n, dtype=torch.float64) / (2 * n)).clamp(min=1 / n)
         density = self.spectrum(f)
-        return density.maximum(3 * let_in(f, density, f, n))
+        of_ends = let_in(f, density, f, n)
+        return density.maximum(3 * of_ends).maximum(3 * of_ends.square() / density.clamp(min=1e-300))
 
     def fast(self) -> NoiseSpectrum:
         """What of it is white, or nearly."""

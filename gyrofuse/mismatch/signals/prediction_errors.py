@@ -20,6 +20,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from gyrofuse.mismatch.signals.derived import derived
+from gyrofuse.mismatch.signals.noise_spectrum import let_in
 from gyrofuse.mismatch.signals.records import Records
 from gyrofuse.mismatch.stats.kurtosis import clipped_sd
 
@@ -100,7 +101,14 @@ def _errors(signal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     white = _inverse_dct(y / spectrum.sqrt())
     inverse = _inverse(spectrum)
     error = _inverse_dct(y * inverse) / (inverse * (1 - followed)).mean()
-    return error, white, lines.any() | _ends_leak(error, white)
+    return error, white, lines.any() | _nothing_slow(spectrum) | _ends_leak(error, white)
+
+
+def _nothing_slow(spectrum: Tensor) -> Tensor:
+    """Whether slow ordinates of a density `(k,)` hold little but what the ends let in, as after a high-pass."""
+    share, n, middle = 0.05, len(spectrum), 16  # of white noise it is an 80th of that ordinate
+    f = torch.arange(1, n + 1, dtype=torch.float64) / (2 * n)
+    return let_in(f, spectrum, f[middle - 1 : middle], n)[0] > share * spectrum[:middle].mean()
 
 
 def _inverse(spectrum: Tensor) -> Tensor:

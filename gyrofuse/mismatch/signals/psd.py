@@ -100,7 +100,10 @@ def cross_spectra(signal: Tensor, wanted: Bands) -> Tensor:
     The signal may be as long as `wanted.n_samples` or not: bands keep their frequencies.
     """
     n = signal.shape[-1]
-    transform = torch.fft.rfft((signal - signal.mean(-1, keepdim=True)) * smooth_ends(n), n=2 * n)
+    # The mean of what the taper leaves: after a high-pass that of all samples is what the ends have by chance.
+    taper = smooth_ends(n)
+    centred = signal - (signal @ taper / taper.sum())[..., None]
+    transform = torch.fft.rfft(centred * taper, n=2 * n)
     matrices, scale = [], n / wanted.n_samples
     # Half bins around each bin, `(..., sensor, bin, half bin)`, from the first one that has so many below it.
     first_whole, last = _TAPERS // 2, (n - _TAPERS) // 2
@@ -142,6 +145,23 @@ def taper_window(n_samples: int, per_bin: int) -> Tensor:
     tapers = 2 * torch.sin(math.pi * k * t) / math.sqrt(2 * n_samples) * smooth_ends(n_samples)
     transform = torch.fft.fft(tapers, n=per_bin * n_samples)
     return (transform.real.square() + transform.imag.square()).mean(0)
+
+
+def leaked(density: Tensor, wanted: Bands) -> Tensor:
+    """Power in bands that tapers let in from outside of their own bandwidth, `(sensor, band)`, per sample.
+
+    Args:
+        density: Of the bins of a record from 0 to half the rate, `(sensor, bin)`.
+        wanted: Bands of records of that length.
+    """
+    n = wanted.n_samples
+    window = taper_window(n, 1) / n
+    reach = _TAPERS
+    window[: reach + 1] = 0.0
+    window[-reach:] = 0.0
+    both = torch.cat([density, density[:, 1 : n - density.shape[-1] + 1].flip(-1)], -1)  # as many bins as samples
+    let_in = torch.fft.irfft(torch.fft.rfft(both) * torch.fft.rfft(window), n=n).clamp(min=0.0)
+    return torch.stack([let_in[:, a:b].mean(-1) for a, b in itertools.pairwise(wanted.edges)], -1)
 
 
 @functools.lru_cache(maxsize=1024)

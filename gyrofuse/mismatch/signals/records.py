@@ -20,6 +20,7 @@ from gyrofuse.mismatch.signals.psd import (
     cross_spectra,
     degrees_of_freedom,
     drawn_towards,
+    leaked,
     median_powers,
     narrow_bands,
 )
@@ -127,7 +128,19 @@ class Records:
     @cached_property
     def evenness(self) -> Tensor:
         """Share of each band's ordinates that its power is known from, `(band,)`."""
-        return self.even_share(self.bands.nodes.unflatten(-1, (-1, N_NODES)))
+        return self.even_share(self.bands.nodes.unflatten(-1, (-1, N_NODES))) * self._own_share
+
+    @cached_property
+    def _own_share(self) -> Tensor:
+        """Share of each band's power that is its own, and not leakage, which bands side by side share, `(band,)`."""
+        seen = 1e-5  # of the strongest band: tapers leak less
+        faint = (self.power < seen * self.power.amax(-1, keepdim=True)).any(0)
+        if not bool(faint.any()):
+            return torch.ones(len(faint), dtype=self.power.dtype)
+        n = self.bands.n_samples
+        let_in = leaked(self.density((torch.arange(n // 2 + 1, dtype=torch.float64) / n).clamp(min=1 / n)), self.bands)
+        share = (1 - let_in.mean(0) / self.power.mean(0).clamp(min=1e-300)).clamp(min=0.0).square()
+        return torch.where(faint, share, 1.0)
 
     @cached_property
     def power_dof(self) -> Tensor:
@@ -204,7 +217,13 @@ class Records:
         power, chance = median_powers(self.steady, narrow)
         apart = (power.clamp(min=1e-300) / narrow.mean_of(self.base.spectrum(narrow.nodes)).clamp(min=1e-300)).log()
         plain = 4.0  # times the variance of chance: of many narrow bands some stand out
-        return drawn_towards(apart, plain * chance, 0.0) * chance.isfinite()
+        known = chance.isfinite()
+        if not bool(known.any()):
+            return torch.zeros_like(apart)
+        ripple = drawn_towards(apart, plain * chance, 0.0)
+        # Where bands are too few to tell it goes on as in the next one: a high-pass has no floor below.
+        place = torch.arange(len(known))
+        return ripple[:, known][:, (place[:, None] - place[known]).abs().argmin(1)]
 
     def density(self, f: Tensor) -> Tensor:
         """Density per sample of base and ripple `(sensor, frequency)` at `f` cycles per sample."""

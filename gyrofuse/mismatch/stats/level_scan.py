@@ -145,14 +145,14 @@ def local_level(values: Tensor) -> Tensor:
 def octave_level(power: Tensor, first: int) -> Tensor:
     """Level of noise near each bin, `(..., 1, bin)`: the median of its octave, over all frames `(..., frame, bin)`.
 
-    In units of the mean of exponential values. Octaves have eight bins at least, from the first one on; a tone is in
-    few of them.
+    In units of the mean of exponential values; one where nothing is known. Octaves have eight bins at least, from the
+    first one on; a tone is in few of them. What is not a number does not count.
     """
     n = power.shape[-1]
     level, low, width = torch.ones_like(power[..., :1, :]), first, 8
     while low < n:
         high = low + width if low + 2 * width <= n else n
-        octave = power[..., low:high].flatten(-2).median(-1).values / math.log(2)
-        level[..., low:high] = octave[..., None, None].clamp(min=1e-30)
+        octave = power[..., low:high].flatten(-2).nanmedian(-1).values / math.log(2)
+        level[..., low:high] = torch.where(octave > 0, octave, 1.0)[..., None, None]
         low, width = high, max(high, 8)
     return level

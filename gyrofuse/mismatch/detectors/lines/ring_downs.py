@@ -159,7 +159,8 @@ def _powers(white: Tensor, tau: int) -> Iterator[_Part]:
     lowest = reach  # a cycle for a time constant: what is slower is a step or a drift
     taper = torch.exp(-torch.arange(length, dtype=white.dtype) / tau)
     taper /= taper.square().sum().sqrt()
-    frames = white.unfold(-1, length, hop)  # (sensor, frame, time)
+    late = 2  # frames: what the start of a record lets in has died away by then, as a tone from then on has not
+    frames = white.unfold(-1, length, hop)[:, late:]  # (sensor, frame, time)
 
     def power(part: Tensor, taper: Tensor) -> Tensor:
         return squared_modulus(torch.fft.rfft(part * taper))[..., lowest:-1].clamp(min=1e-30)
@@ -172,13 +173,13 @@ def _powers(white: Tensor, tau: int) -> Iterator[_Part]:
     smooth = torch.hann_window(length, dtype=white.dtype)
     own = middle(smooth / smooth.norm())
     # A window that begins at once leaks: where a filter holds nearly all back its first sample is all the power.
-    usual = torch.where((usual := middle(taper)) < leaks * own, usual, torch.inf)
-    at_once, first = max(numbers_at_once // (length * len(white)), local), 0
+    usual = torch.where((usual := middle(taper)) < leaks * own, usual, torch.nan)
+    at_once, first = max(numbers_at_once // (length * len(white)), local), late * hop
     for some in frames.tensor_split(max(frames.shape[1] // at_once, 1), 1):
         over = power(some, taper) / usual
         for stretch in over.tensor_split(max(over.shape[1] // local, 1), 1):
             stretch /= octave_level(stretch, 0)
-        yield _Part(over, first, hop, lowest, tau, length)
+        yield _Part(over.nan_to_num_(0.0), first, hop, lowest, tau, length)
         first += hop * some.shape[1]
 
 

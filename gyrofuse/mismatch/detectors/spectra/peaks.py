@@ -15,7 +15,13 @@ from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.detectors.spectra.modulated_ordinates import level_correlations
 from gyrofuse.mismatch.detectors.spectra.own_peak_scan import scanned_own_peaks
-from gyrofuse.mismatch.detectors.spectra.shared_peak_scan import Stretches, flank_of, log_ratios, scanned_shared_peaks
+from gyrofuse.mismatch.detectors.spectra.shared_peak_scan import (
+    LOWEST,
+    Stretches,
+    flank_of,
+    log_ratios,
+    scanned_shared_peaks,
+)
 from gyrofuse.mismatch.likelihoods.spectra.coherence import decorrelated
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
@@ -90,7 +96,7 @@ def strongest_peak(comparison: Comparison) -> Stretch:
         if simulation is None:
             simulation = _Transform.of(comparison.lineless_reference)
         own, others = _BesideFlanks.of(recording, stretch), _BesideFlanks.of(simulation, stretch)
-        if not line and own.stands_out and not others.stands_out:
+        if not line and own.stands_out and not others.stands_out and simulation.is_level_around(stretch):
             return stretch
         as_scanned = float(best.log_ratio.amax())
         for scan in scans:
@@ -127,6 +133,18 @@ class _Transform(NamedTuple):
         n = white.shape[-1]
         length = fast_length(n)
         return cls(torch.fft.rfft(white * light_taper(n), n=length), length, n / length / _DEPENDENT)
+
+    def is_level_around(self, stretch: Stretch) -> bool:
+        """Whether a stretch and its flanks are as level as chance has noise: then flanks tell what is between them."""
+        n, total = max(round(stretch.width * self.length), 1), self.bins.shape[-1]
+        middle, reach = round(stretch.frequency * self.length), n + flank_of(n, total)
+        own = squared_modulus(self.bins[..., max(middle - reach, LOWEST) : min(middle + reach, total)])
+        parts = max(min(32, own.shape[-1] // max(n // 2, 8)), 2)
+        cells = torch.stack([part.mean((0, -1)) for part in own.tensor_split(parts, -1)], -1)  # (sensor, cell)
+        each = own.shape[0] * own.shape[-1] / parts * self.ordinates
+        apart = cells.clamp(min=1e-300).log()
+        chi2 = each * (apart - apart.mean(-1, keepdim=True)).square().sum()
+        return bool(stats.chi2.sf(float(chi2), len(cells) * (parts - 1)) > _AS_WELL)
 
 
 def _apart(transform: Tensor, length: int, comparison: Comparison) -> Tensor:
