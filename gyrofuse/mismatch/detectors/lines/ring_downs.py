@@ -178,7 +178,7 @@ def _powers(white: Tensor, tau: int) -> Iterator[_Part]:
     for some in frames.tensor_split(max(frames.shape[1] // at_once, 1), 1):
         over = power(some, taper) / usual
         for stretch in over.tensor_split(max(over.shape[1] // local, 1), 1):
-            stretch /= octave_level(stretch, 0)
+            stretch /= octave_level(stretch, 0).clamp(min=1.0)  # a lower one may be chance
         yield _Part(over.nan_to_num_(0.0), first, hop, lowest, tau, length)
         first += hop * some.shape[1]
 
