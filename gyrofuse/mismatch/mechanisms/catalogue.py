@@ -32,6 +32,7 @@ from gyrofuse.mismatch.mechanisms.signals.tone_amplitude import ToneSize
 from gyrofuse.mismatch.mechanisms.signals.warm_up import WarmUpTransient
 from gyrofuse.mismatch.mechanisms.slow_remainder import SlowRemainder
 from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
+from gyrofuse.mismatch.mechanisms.spectra.cross_talk import CrossTalk
 from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.notch import NotchFilter
@@ -56,7 +57,7 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (GradualChange,),  # where noise is louder, what is slow is known less well
     (TemperatureDrift, WarmUpTransient, Ramp, Step),
     (VarianceChange,),  # to which large jumps look alike
-    (ParameterShift, LowPassFilter, NotchFilter, Resonance, DriftingTone, FlickerNoise, CommonMode),
+    (ParameterShift, LowPassFilter, NotchFilter, Resonance, DriftingTone, FlickerNoise, CommonMode, CrossTalk),
 )
 
 # What is left of slow courses and of spectra once nothing with a name is found any more.

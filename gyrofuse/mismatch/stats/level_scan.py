@@ -14,7 +14,7 @@ themselves, ratios are tempered: `E^w`, with `w` the weight of a sample (`level_
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import torch
@@ -142,17 +142,22 @@ def local_level(values: Tensor) -> Tensor:
     return level / level.mean(-1, keepdim=True)
 
 
+def octaves(first: int, n: int) -> Iterator[slice]:
+    """Bins from a first one up to `n`, in octaves of eight at least."""
+    low, width = first, 8
+    while low < n:
+        high = low + width if low + 2 * width <= n else n
+        yield slice(low, high)
+        low, width = high, max(high, 8)
+
+
 def octave_level(power: Tensor, first: int) -> Tensor:
     """Level of noise near each bin, `(..., 1, bin)`: the median of its octave, over all frames `(..., frame, bin)`.
 
-    In units of the mean of exponential values; one where nothing is known. Octaves have eight bins at least, from the
-    first one on; a tone is in few of them. What is not a number does not count.
+    In units of the mean of exponential values; one where nothing is known. What is not a number does not count.
     """
-    n = power.shape[-1]
-    level, low, width = torch.ones_like(power[..., :1, :]), first, 8
-    while low < n:
-        high = low + width if low + 2 * width <= n else n
-        octave = power[..., low:high].flatten(-2).nanmedian(-1).values / math.log(2)
-        level[..., low:high] = torch.where(octave > 0, octave, 1.0)[..., None, None]
-        low, width = high, max(high, 8)
+    level = torch.ones_like(power[..., :1, :])
+    for octave in octaves(first, power.shape[-1]):
+        own = power[..., octave].flatten(-2).nanmedian(-1).values / math.log(2)
+        level[..., octave] = torch.where(own > 0, own, 1.0)[..., None, None]
     return level

@@ -26,7 +26,7 @@ from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
-from gyrofuse.mismatch.stats.level_scan import local_level, octave_level
+from gyrofuse.mismatch.stats.level_scan import local_level, octave_level, octaves
 from gyrofuse.mismatch.stats.multiplicity import e_value_of_some, p_value_beyond_reference
 
 
@@ -162,12 +162,18 @@ def _powers(white: Tensor, tau: int) -> Iterator[_Part]:
     late = 2  # frames: what the start of a record lets in has died away by then, as a tone from then on has not
     frames = white.unfold(-1, length, hop)[:, late:]  # (sensor, frame, time)
 
+    some = frames[:, :: -(-frames.shape[1] // most_for_median)]
+
+    def transform(part: Tensor, taper: Tensor) -> Tensor:
+        return torch.fft.rfft(part * taper)[..., lowest:-1]
+
+    apart = _decorrelating(transform(some, taper))
+
     def power(part: Tensor, taper: Tensor) -> Tensor:
-        return squared_modulus(torch.fft.rfft(part * taper))[..., lowest:-1].clamp(min=1e-30)
+        return squared_modulus(_apart_by(apart, transform(part, taper))).clamp(min=1e-30)
 
     def middle(taper: Tensor) -> Tensor:
         """Median over time, in units of the mean of exponential values, `(sensor, 1, bin)`."""
-        some = frames[:, :: -(-frames.shape[1] // most_for_median)]
         return power(some, taper).median(1, keepdim=True).values / math.log(2)
 
     smooth = torch.hann_window(length, dtype=white.dtype)
@@ -175,12 +181,42 @@ def _powers(white: Tensor, tau: int) -> Iterator[_Part]:
     # A window that begins at once leaks: where a filter holds nearly all back its first sample is all the power.
     usual = torch.where((usual := middle(taper)) < leaks * own, usual, torch.nan)
     at_once, first = max(numbers_at_once // (length * len(white)), local), late * hop
-    for some in frames.tensor_split(max(frames.shape[1] // at_once, 1), 1):
-        over = power(some, taper) / usual
+    for part in frames.tensor_split(max(frames.shape[1] // at_once, 1), 1):
+        over = power(part, taper) / usual
         for stretch in over.tensor_split(max(over.shape[1] // local, 1), 1):
             stretch /= octave_level(stretch, 0).clamp(min=1.0)  # a lower one may be chance
         yield _Part(over.nan_to_num_(0.0), first, hop, lowest, tau, length)
-        first += hop * some.shape[1]
+        first += hop * part.shape[1]
+
+
+def _decorrelating(transform: Tensor) -> list[tuple[slice, Tensor]]:
+    """What takes off what sensors `(sensor, frame, bin)` share, octave by octave; each stays as near as it can.
+
+    Moduli are cut to 3.4 medians of their bin, one in three thousand of noise: what rings is nothing that they share.
+    """
+    if len(transform) == 1:
+        return []
+    size = transform.abs()
+    usual = size.median(1, keepdim=True).values.clamp(min=1e-15)
+    cut = transform / usual * (3.4 * usual / size.clamp(min=1e-15)).clamp(max=1.0)
+    found = []
+    for octave in octaves(0, transform.shape[-1]):
+        cells = cut[..., octave].flatten(1)
+        shared = cells @ cells.mH
+        norm = shared.diagonal().real.clamp(min=1e-15).rsqrt()
+        values, vectors = torch.linalg.eigh(shared * norm[:, None] * norm)
+        root = (vectors * values.clamp(min=1e-2).rsqrt()) @ vectors.mH  # in float32 a hundredth is known
+        scale = usual[:, 0, octave].mean(-1)
+        found.append((octave, root * scale[:, None] / scale))
+    return found
+
+
+def _apart_by(roots: list[tuple[slice, Tensor]], transform: Tensor) -> Tensor:
+    """A transform `(sensor, frame, bin)` without what sensors share."""
+    if not roots:
+        return transform
+    parts = [torch.einsum("ij,jtf->itf", root, transform[..., octave]) for octave, root in roots]
+    return torch.cat(parts, -1)
 
 
 def _log_ratios(score: Tensor) -> Tensor:

@@ -52,7 +52,8 @@ class CommonMode(Addition):
     """
 
     name: ClassVar[str] = "common_mode"
-    rivals: ClassVar[tuple[str, ...]] = ("parameter_shift", "low_pass", "flicker", "g_sensitivity")
+    rivals: ClassVar[tuple[str, ...]] = ("parameter_shift", "low_pass", "flicker", "g_sensitivity", "cross_talk")
+    replaced_by: ClassVar[tuple[str, ...]] = ("cross_talk",)
     separated_by: ClassVar[str] = "one sensor mounted apart, or on another supply"
     kind: str
     corner: float

@@ -1,0 +1,121 @@
+"""Cross-talk: what a sensor has of the signals of others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated, ClassVar
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.decisions import NATS_AS_GOOD, NATS_PER_NUMBER, NEW_TERM_NATS
+from gyrofuse.mismatch.detectors.spectra.pooled_coherence import common_source
+from gyrofuse.mismatch.likelihoods.spectra.data import block_spectra
+from gyrofuse.mismatch.likelihoods.spectra.mixing import Mixing, mixing_of
+from gyrofuse.mismatch.mechanisms import pictures
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter, Rival
+from gyrofuse.mismatch.mechanisms.spectra.joint_fit import leading_shape
+from gyrofuse.mismatch.mechanisms.spectra.spectral import Spectral
+from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.dims import Dims
+from gyrofuse.mismatch.signals.folds import N_JUDGED, in_fold
+from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum
+from gyrofuse.mismatch.stats.limits import Z
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+@dataclass(frozen=True, eq=False)
+class CrossTalk(Spectral):
+    """`x_i -> x_i + sum_j m_ij x_j`: cross-talk of lines and converters, cross-axis sensitivity.
+
+    Sensors share, in phase and at all frequencies alike, what others have of their own. A source in common is one more
+    signal: it makes as many gains as there are sensors, and has one spectrum, whatever theirs are.
+
+    Attributes:
+        mixing: `m`, of the row's sensor what it has of the column's, `(sensor, sensor)`; zeros on the diagonal.
+    """
+
+    name: ClassVar[str] = "cross_talk"
+    rivals: ClassVar[tuple[str, ...]] = ("common_mode",)
+    separated_by: ClassVar[str] = "a known motion of one axis"
+    mixing: Annotated[Tensor, Dims(("sensor", "sensor"))]
+
+    @classmethod
+    def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
+        source = common_source(comparison)
+        if source is None or not source.independent or source.p_value > level:
+            return None
+        found = _mixing(comparison, torch.ones(N_JUDGED, dtype=torch.bool))
+        best = leading_shape(comparison)
+        if best is not None and best.term.coherent:  # one source is simpler: it has to be plainly worse
+            least = best.gain - NATS_PER_NUMBER * int(best.term.free.sum()) + NATS_AS_GOOD
+        else:
+            least = NEW_TERM_NATS
+        if found.worth < least:
+            return None
+        info, parameters = comparison.info, {}
+        rows, columns = found.free.nonzero(as_tuple=True)
+        for i, j in zip(rows.tolist(), columns.tolist(), strict=True):
+            m, reach = float(found.matrix[i, j]), Z * float(found.sd[i, j])
+            parameters[f"part_of_{j + 1}[{i}]"] = Parameter(m, m - reach, m + reach, "")
+        told = (found.matrix.abs() > Z * found.sd) & found.free
+        sensors = tuple((told | (found.free & ~told & ~told.mT)).any(-1).nonzero()[:, 0].tolist())
+        return Finding(
+            cls.name,
+            cls(found.matrix),
+            f"cross-talk that the simulation does not have, in {info.named(sensors, 'all sensors')}: "
+            + _largest(found.matrix, told, info),
+            source.p_value,
+            sensors,
+            parameters,
+            gain=found.gain,
+        )
+
+    @classmethod
+    def fit_in_place_of(cls, finding: Finding, comparison: Comparison) -> Rival | None:
+        if comparison.n_sensors < 2:
+            return None
+        found = _mixing(comparison, torch.ones(N_JUDGED, dtype=torch.bool))
+        return Rival(cls(found.matrix), found.worth) if bool(found.free.any()) else None
+
+    def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
+        return signal + self.mixing.to(signal) @ signal
+
+    def spectra(self, matrices: Tensor, f: Tensor) -> Tensor:
+        mixed = (torch.eye(len(self.mixing), dtype=self.mixing.dtype) + self.mixing).to(matrices.dtype)
+        return mixed @ matrices @ mixed.mT
+
+    def factor(self, base: NoiseSpectrum, f: Tensor) -> Tensor:
+        power = base.spectrum(f)
+        return 1 + self.mixing.square() @ power / power
+
+    def fit_without(self, comparison: Comparison, fold: int) -> CrossTalk:
+        found = _mixing(comparison, ~in_fold(N_JUDGED, fold), self.mixing != 0)
+        return replace(self, mixing=found.matrix)
+
+    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+        pictures.coherence(ax, comparison, sensor)
+
+
+def _largest(mixing: Tensor, told: Tensor, info: RecordingInfo) -> str:
+    """What is said of the largest entry, or of the largest pair where spectra do not tell which has the other's."""
+    p = len(mixing)
+    if bool(told.any()):
+        i, j = divmod(int((mixing.abs() * told).argmax()), p)
+        return (
+            f"sensor {info.sensors[i]} has {100 * float(mixing[i, j]):.3g} % of the signal of sensor {info.sensors[j]}"
+        )
+    i, j = divmod(int((mixing + mixing.mT).abs().argmax()), p)
+    return (
+        f"sensors {info.sensors[i]} and {info.sensors[j]} have {100 * float(mixing[i, j] + mixing[j, i]):.3g} % of "
+        "each other's signals, of spectra too much alike to tell which has how much"
+    )
+
+
+def _mixing(comparison: Comparison, blocks: Tensor, free: Tensor | None = None) -> Mixing:
+    """That of some of the recording's blocks."""
+    matrices, dof = block_spectra(comparison).observed.mean(blocks)
+    known = dof >= 2 * comparison.n_sensors  # of fewer ordinates a matrix may be singular
+    return mixing_of(matrices[known], dof[known], free)
