@@ -54,6 +54,7 @@ _MECHANISMS: dict[str, Callable[[Bench, float], Part]] = {
     "flicker": spectral.power_law,
     "g_sensitivity": shapes.g_sensitivity,
     "common_mode": spectral.common_mode,
+    "cross_talk": spectral.cross_talk,
     "scale_factor": shapes.scale_factor,
     "clock_skew": shapes.clock_skew,
     "clock_lost_samples": _with(shapes.clock_skew, lost=True),

@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 
 from . import converter, mechanics
 from .analog import OVERSAMPLING, bank_spectrum, relaxator_bank
 from .bench import SEPARABLE, Bench, Part, quantity, rms
 from .likelihood import (
+    OutOfReachError,
     ar1_spectrum,
     coefficients,
     comparison,
@@ -228,6 +230,86 @@ def common_mode(bench: Bench, nats: float) -> Part:
         sensor_nats=tuple(nats - others for others in without),
         parameters={"gain": quantity(rms(level[list(sensors)]), "deg/s", level[list(sensors)])},
     )
+
+
+def cross_talk(bench: Bench, nats: float) -> Part:
+    """Some sensors have parts of the signals of one or two others, before the converter.
+
+    The nats are those of the comparison of matrices, as of `common_mode`.
+    """
+    p = bench.n_sensors
+    if p < 2:
+        raise OutOfReachError("expected two sensors or more for cross-talk, got one")
+    sensors = bench.some_sensors(1)
+    unit = np.zeros((p, p))
+    for i in sensors:
+        others = [j for j in range(p) if j != i]
+        for j in bench.rng.choice(others, min(int(bench.rng.integers(1, 3)), p - 1), replace=False):
+            # A part of a sensor with ten times the noise shows ten times as much.
+            unit[i, j] = bench.rng.uniform(0.5, 1.0) * bench.rng.choice([-1, 1]) * bench.sigma[i] / bench.sigma[j]
+    sparse = bench.spectrum[:, ::16]  # smooth: one frequency of 16 tells
+    root = np.sqrt(sparse).T  # (frequency, sensor)
+
+    def matrices(size: float, rows: Array | float = 1.0) -> Array:
+        """Cross-spectra over those of the base, `(frequency, sensor, sensor)`."""
+        mixed = (np.eye(p) + size * np.reshape(rows, (-1, 1)) * unit) * root[:, None, :] / root[:, :, None]
+        return np.asarray(mixed @ mixed.transpose(0, 2, 1))
+
+    def divergence_of(made: Array) -> float:
+        return float(8 * (np.trace(made, axis1=1, axis2=2) - p - np.linalg.slogdet(made)[1]).sum())
+
+    def expected(size: float, rows: Array | float = 1.0) -> float:
+        made = matrices(size, rows)
+        if math.isinf(bench.share):
+            return divergence_of(made)
+        both = (made + bench.share * np.eye(p)) / (1 + bench.share)
+        return float(8 * ((1 + bench.share) * np.linalg.slogdet(both)[1] - np.linalg.slogdet(made)[1]).sum())
+
+    size = solve(nats, expected, 1e-5, 0.6)
+    mixing = size * unit
+    without = [expected(size, np.arange(p) != i) for i in sensors]
+    volume = bench.spectrum.shape[1] * float(np.linalg.slogdet(np.eye(p) + mixing)[1])
+
+    def llr(recording: Array) -> float:
+        x = coefficients(recording)
+        unmixed = np.linalg.solve(np.eye(p) + mixing, x)
+        return float(((x**2 - unmixed**2) / bench.spectrum).sum() / 2) - volume
+
+    null = quadratic_null(np.linalg.eigvalsh(matrices(size)))
+    part = {f"part_of_{j + 1}": mixing[list(sensors), j] for j in range(p) if mixing[:, j].any()}
+    return Part(
+        "cross_talk",
+        nats,
+        sensors,
+        llr,
+        oracle_nats=divergence_of(matrices(size)),
+        oracle_null=(16 * null[0], 16 * null[1], 16 * null[2]),
+        analog=lambda analog: analog + mixing @ analog,
+        sensor_nats=tuple(nats - others for others in without),
+        look_alikes=("common_mode",) if _beyond_one_source(matrices(size)) < SEPARABLE else (),
+        parameters={name: quantity(rms(values), "", values) for name, values in part.items()},
+    )
+
+
+def _beyond_one_source(made: Array) -> float:
+    """Nats of cross-spectra over a base's `(frequency, sensor, sensor)`, each for 16, that no white source explains.
+
+    In place of the likeliest gains, those that least squares has.
+    """
+    p = made.shape[1]
+    coherence = made / np.sqrt(np.einsum("fii->fi", made)[:, :, None] * np.einsum("fii->fi", made)[:, None, :])
+    pairs = np.triu_indices(p, 1)
+    wanted = coherence[:, pairs[0], pairs[1]]
+    level = 1 / np.sqrt(
+        np.einsum("fii->fi", made)
+    )  # of white noise over the whole: the base is white above its corners
+
+    def left(gains: Array) -> Array:
+        return (wanted - (gains * level)[:, pairs[0]] * (gains * level)[:, pairs[1]]).ravel()
+
+    values, vectors = np.linalg.eigh(coherence.mean(0) - np.eye(p))
+    start = vectors[:, -1] * math.sqrt(max(values[-1], 1e-6))
+    return float(8 * np.square(least_squares(left, start).fun).sum())
 
 
 def low_pass(bench: Bench, nats: float) -> Part:

@@ -1,12 +1,13 @@
-"""Which real mixing of independent sensors the cross-spectra of a recording show.
+"""Which real mixing of sensors the cross-spectra of a recording show, beside what a simulation's sensors share.
 
-Signals `x = M y` of independent `y` of any spectra have the log likelihood, but for a constant and with the powers at
-their likeliest,
+Signals `x = M y` of `y` of any powers and coherences `C_b` have the log likelihood, but for a constant and with the
+powers at their likeliest,
 
-    L(M) = -sum_b d_b [sum_i log (M^-1 S_b M^-T)_ii + 2 log |det M|].
+    L(M) = -sum_b d_b [sum_i log (M^-1 S_b M^-T)_ii + 2 log |det M| + log |C_b| + tr C_b^-1 K_b],
 
-It is largest where `M^-1 S_b M^-T` is as diagonal as it can be in all bands together (Pham). What a sensor has of
-another one is told from what that one has of it by their spectra alone: of alike ones only the sum is known.
+with the coherences `K_b` of `M^-1 S_b M^-T`. It is largest where those are as near to `C_b` as they can be in all bands
+together; of independent `y`, where the matrices are as diagonal as they can be (Pham). What a sensor has of another one
+is told from what that one has of it by their spectra alone: of alike ones only the sum is known.
 
 References:
     Pham, Joint approximate diagonalization of positive definite Hermitian matrices, SIAM Journal on Matrix Analysis and
@@ -21,8 +22,6 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.decisions import NATS_PER_NUMBER
-
-_PRIOR_SD = 0.3  # of an entry: more than cross-talk has, and less than lets two sensors change places
 
 
 class Mixing(NamedTuple):
@@ -46,68 +45,98 @@ class Mixing(NamedTuple):
         return self.gain - NATS_PER_NUMBER * int(self.free.sum())
 
 
-def mixing_of(spectra: Tensor, dof: Tensor, free: Tensor | None = None) -> Mixing:
+class _Seen(NamedTuple):
+    """What is known of it.
+
+    Attributes:
+        spectra: Cross-spectra of a recording, `(band, sensor, sensor)`.
+        dof: Complex ordinates of each, `(band,)`.
+        coherence: What a simulation's sensors share, `(band, sensor, sensor)`.
+    """
+
+    spectra: Tensor
+    dof: Tensor
+    coherence: Tensor
+
+    def unmixed(self, matrix: Tensor) -> tuple[Tensor, Tensor]:
+        """Powers `(band, sensor)` and coherences `(band, sensor, sensor)` without a mixing."""
+        inverse = torch.linalg.inv(torch.eye(len(matrix), dtype=matrix.dtype) + matrix).to(self.spectra.dtype)
+        left = inverse @ self.spectra @ inverse.mT
+        power = left.diagonal(dim1=-2, dim2=-1).real.clamp(min=1e-300)
+        size = power.rsqrt()
+        return power, left * size[:, :, None] * size[:, None, :]
+
+    def log_likelihood(self, matrix: Tensor) -> float:
+        """`L`, but for what the coherences of the simulation alone make of it."""
+        power, coherence = self.unmixed(matrix)
+        volume = torch.linalg.slogdet(torch.eye(len(matrix), dtype=matrix.dtype) + matrix).logabsdet
+        surprise = torch.linalg.solve(self.coherence, coherence).diagonal(dim1=-2, dim2=-1).real.sum(-1)
+        return -float((self.dof * (power.log().sum(-1) + 2 * volume + surprise)).sum())
+
+    def normal_equations(self, matrix: Tensor) -> tuple[Tensor, Tensor]:
+        """Of each entry together with its mirror image.
+
+        Returns:
+            Right-hand sides `(sensor, sensor)`, and the information `(sensor, sensor, 2)`: of an entry itself, and with
+            its mirror image.
+        """
+        power, coherence = self.unmixed(matrix)
+        weight = 2 * self.dof[:, None, None]  # of real parts, which have half of the variance
+        over = (power[:, None, :] / power[:, :, None]).sqrt()  # coherence that a part of the column's makes in the row
+        itself = (weight * over.square()).sum(0)
+        mirrored = weight.sum(0).expand_as(itself)
+        slope = (weight * over * (coherence - self.coherence).real).sum(0)
+        return slope + itself * matrix + mirrored * matrix.mT, torch.stack([itself, mirrored], -1)
+
+
+def mixing_of(spectra: Tensor, dof: Tensor, coherence: Tensor, free: Tensor | None = None) -> Mixing:
     """The likeliest mixing.
+
+    Entries are drawn towards none by their own scatter: where spectra are alike two sensors could change places.
 
     Args:
         spectra: Cross-spectra of a recording, `(band, sensor, sensor)`.
         dof: Complex ordinates of each, `(band,)`.
+        coherence: What the simulation's sensors share, `(band, sensor, sensor)`.
         free: Entries that are fitted; by default those of pairs that gain more than their numbers cost.
     """
-    rounds, settled, p = 60, 1e-7, spectra.shape[-1]
+    seen, p, first_sd = _Seen(spectra, dof, coherence), spectra.shape[-1], 0.03
     matrix = torch.zeros(p, p, dtype=torch.float64)
-    chosen = ~torch.eye(p, dtype=torch.bool) if free is None else free
-    for turn in range(rounds):
-        wanted, information = _normal_equations(spectra, dof, matrix)
-        if free is None and turn < rounds // 2:  # then they stay
-            chosen = _worth(wanted, information)
-        new = _solved(wanted, information, chosen)[0]
+    chosen = _worth(*seen.normal_equations(matrix), first_sd) if free is None else free
+    if bool(chosen.any()):
+        matrix = _settled(seen, matrix, chosen, first_sd)
+        scatter = 2 * float(matrix[chosen].square().mean().sqrt())
+        matrix = _settled(seen, matrix, chosen, max(scatter, 1e-6))
+    else:
+        scatter = first_sd
+    sd = _solved(*seen.normal_equations(matrix), chosen, max(scatter, 1e-6))[1]
+    return Mixing(matrix, chosen, sd, seen.log_likelihood(matrix) - seen.log_likelihood(torch.zeros_like(matrix)))
+
+
+def _settled(seen: _Seen, matrix: Tensor, free: Tensor, prior_sd: float) -> Tensor:
+    """Where the normal equations no longer move it."""
+    rounds, least = 30, 1e-7
+    for _ in range(rounds):
+        new, _ = _solved(*seen.normal_equations(matrix), free, prior_sd)
         step, matrix = float((new - matrix).abs().max()), new
-        if step < settled:
+        if step < least:
             break
-    sd = _solved(*_normal_equations(spectra, dof, matrix), chosen)[1]
-    return Mixing(matrix, chosen, sd, _log_likelihood(spectra, dof, matrix) - _log_likelihood(spectra, dof, 0 * matrix))
+    return matrix
 
 
-def _unmixed(spectra: Tensor, matrix: Tensor) -> Tensor:
-    inverse = torch.linalg.inv(torch.eye(len(matrix), dtype=matrix.dtype) + matrix).to(spectra.dtype)
-    return inverse @ spectra @ inverse.mT
-
-
-def _log_likelihood(spectra: Tensor, dof: Tensor, matrix: Tensor) -> float:
-    own = _unmixed(spectra, matrix).diagonal(dim1=-2, dim2=-1).real.clamp(min=1e-300)
-    volume = torch.linalg.slogdet(torch.eye(len(matrix), dtype=matrix.dtype) + matrix).logabsdet
-    return -float((dof * (own.log().sum(-1) + 2 * volume)).sum())
-
-
-def _normal_equations(spectra: Tensor, dof: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """Of each entry together with its mirror image: the slopes at none, and the information.
-
-    Slopes `(sensor, sensor)`; information `(sensor, sensor, 2)`: of an entry itself, and with its mirror image.
-    """
-    left = _unmixed(spectra, matrix)
-    own = left.diagonal(dim1=-2, dim2=-1).real.clamp(min=1e-300)  # (band, sensor)
-    weight = 2 * dof[:, None, None]  # of real parts: half of the variance of complex ones
-    ratio = own[:, None, :] / own[:, :, None]  # what a part of the column's adds, over the row's
-    itself = (weight * ratio).sum(0)
-    mirrored = weight.sum(0).expand_as(itself)
-    slope = (weight * left.real / own[:, :, None]).sum(0)
-    return slope + itself * matrix + mirrored * matrix.mT, torch.stack([itself, mirrored], -1)
-
-
-def _solved(wanted: Tensor, information: Tensor, free: Tensor) -> tuple[Tensor, Tensor]:
+def _solved(wanted: Tensor, information: Tensor, free: Tensor, prior_sd: float) -> tuple[Tensor, Tensor]:
     """Entries and their standard deviations, each beside its mirror image where that is free as well."""
-    own, with_other = information[..., 0] + 1 / _PRIOR_SD**2, information[..., 1] * (free & free.mT)
+    own, with_other = information[..., 0] + 1 / prior_sd**2, information[..., 1] * (free & free.mT)
     determinant = own * own.mT - with_other.square()
     entry = (own.mT * wanted - with_other * wanted.mT) / determinant
     return torch.where(free, entry, 0.0), torch.where(free, (own.mT / determinant).sqrt(), 0.0)
 
 
-def _worth(wanted: Tensor, information: Tensor) -> Tensor:
+def _worth(wanted: Tensor, information: Tensor, prior_sd: float) -> Tensor:
     """Pairs whose entries gain more than they cost, `(sensor, sensor)`; both, since either may stand for the other."""
     p = len(wanted)
     every = ~torch.eye(p, dtype=torch.bool)
-    entry, _ = _solved(wanted, information, every)
+    entry, _ = _solved(wanted, information, every, prior_sd)
     gain = (entry * wanted + (entry * wanted).mT) / 2
     cost = 2 * NATS_PER_NUMBER + torch.tensor(p * (p - 1) / 2).log()  # which pair is searched
     return every & (gain > cost)

@@ -115,6 +115,13 @@ class CommonMode(Addition):
             return None
         return Rival(cls(term.kind, 0.0, torch.complex(*term.local), comparison.base, term.inside), found[1])
 
+    @classmethod
+    def from_term(cls, term: Term, comparison: Comparison) -> CommonMode | None:
+        if not isinstance(term, Common):
+            return None
+        corner = float(term.shared[0].exp()) if term.kind == "ar1" else 0.0
+        return cls(term.kind, corner, torch.complex(*term.local), reference_noise(comparison), term.inside)
+
     def explained_by_others(
         self, comparison: Comparison, finding: Finding, beside: Sequence[Finding]
     ) -> tuple[str, ...]:

@@ -10,6 +10,8 @@ from torch import Tensor
 
 from gyrofuse.mismatch.decisions import NATS_AS_GOOD, NATS_PER_NUMBER, NEW_TERM_NATS
 from gyrofuse.mismatch.detectors.spectra.pooled_coherence import common_source
+from gyrofuse.mismatch.likelihoods.declared import declared
+from gyrofuse.mismatch.likelihoods.spectra.coherence import smooth_coherence
 from gyrofuse.mismatch.likelihoods.spectra.data import block_spectra
 from gyrofuse.mismatch.likelihoods.spectra.mixing import Mixing, mixing_of
 from gyrofuse.mismatch.mechanisms import pictures
@@ -18,7 +20,7 @@ from gyrofuse.mismatch.mechanisms.spectra.joint_fit import leading_shape
 from gyrofuse.mismatch.mechanisms.spectra.spectral import Spectral
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import Dims
-from gyrofuse.mismatch.signals.folds import N_JUDGED, in_fold
+from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED, in_fold, sd_of_sum
 from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum
 from gyrofuse.mismatch.stats.limits import Z
 
@@ -45,15 +47,10 @@ class CrossTalk(Spectral):
     @classmethod
     def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
         source = common_source(comparison)
-        if source is None or not source.independent or source.p_value > level:
+        if source is None or source.p_value > level:
             return None
         found = _mixing(comparison, torch.ones(N_JUDGED, dtype=torch.bool))
-        best = leading_shape(comparison)
-        if best is not None and best.term.coherent:  # one source is simpler: it has to be plainly worse
-            least = best.gain - NATS_PER_NUMBER * int(best.term.free.sum()) + NATS_AS_GOOD
-        else:
-            least = NEW_TERM_NATS
-        if found.worth < least:
+        if found.worth < NEW_TERM_NATS or _one_source_does_as_well(comparison, cls(found.matrix), found.worth):
             return None
         info, parameters = comparison.info, {}
         rows, columns = found.free.nonzero(as_tuple=True)
@@ -114,8 +111,36 @@ def _largest(mixing: Tensor, told: Tensor, info: RecordingInfo) -> str:
     )
 
 
+def _one_source_does_as_well(comparison: Comparison, mixing: CrossTalk, worth: float) -> bool:
+    """Whether a source in common, which is simpler, explains what sensors share, on blocks held out as well."""
+    best = leading_shape(comparison)
+    if best is None or not best.term.coherent:
+        return False
+    source = next((made for kind in declared(Spectral) if (made := kind.from_term(best.term, comparison))), None)
+    if source is None or worth < best.gain - NATS_PER_NUMBER * int(best.term.free.sum()):
+        return True
+    own, other = (_held_out(one, comparison) for one in (mixing, replace(source, company=best.company)))
+    return float((own - other).sum()) < max(2 * sd_of_sum(own - other), NATS_AS_GOOD)
+
+
+def _held_out(effect: Spectral, comparison: Comparison) -> Tensor:
+    """Scores of all blocks, `(block,)`, each with the numbers of the others."""
+    return torch.cat(
+        [effect.fit_without(comparison, fold).held_out_scores(comparison, fold) for fold in range(N_FOLDS)]
+    )
+
+
 def _mixing(comparison: Comparison, blocks: Tensor, free: Tensor | None = None) -> Mixing:
     """That of some of the recording's blocks."""
-    matrices, dof = block_spectra(comparison).observed.mean(blocks)
-    known = dof >= 2 * comparison.n_sensors  # of fewer ordinates a matrix may be singular
-    return mixing_of(matrices[known], dof[known], free)
+    both, p = block_spectra(comparison), comparison.n_sensors
+    matrices, dof = both.observed.mean(blocks)
+    known = dof >= 2 * p  # of fewer ordinates a matrix may be singular
+    source = common_source(comparison)
+    if source is None or source.independent:
+        shared = torch.eye(p, dtype=matrices.dtype).expand_as(matrices)
+    else:
+        simulated, ordinates = both.reference.mean(torch.ones(N_FOLDS, dtype=torch.bool))
+        size = simulated.diagonal(dim1=-2, dim2=-1).real.clamp(min=1e-300).rsqrt()
+        shared = smooth_coherence(simulated * size[:, :, None] * size[:, None, :], ordinates)
+        dof = dof * ordinates / (dof + ordinates).clamp(min=1e-300)
+    return mixing_of(matrices[known], dof[known], shared[known], free)
