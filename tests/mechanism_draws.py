@@ -34,6 +34,7 @@ from gyrofuse.mismatch.mechanisms.signals.tone_amplitude import ToneSize
 from gyrofuse.mismatch.mechanisms.signals.warm_up import Decay, WarmUpTransient
 from gyrofuse.mismatch.mechanisms.slow_remainder import SlowRemainder
 from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
+from gyrofuse.mismatch.mechanisms.spectra.cross_talk import CrossTalk
 from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.notch import NotchFilter
@@ -347,6 +348,17 @@ def _(setting: Setting) -> Drawn:
     effect = CommonMode(kind, corner, gain, noise_spectrum(setting.n_sensors, setting.n_samples), inside)
     truth = setting.of_each("gain", gain.abs()) | ({"corner": corner * RATE} if corner else {})
     return Drawn(effect, truth)
+
+
+@draws(CrossTalk)
+def _(setting: Setting) -> Drawn:
+    p = setting.n_sensors
+    part = setting.sign() * setting.sizes(0.09, 0.12) * setting.size  # of opposite signs they would share nothing
+    mixing = torch.zeros(p, p, dtype=torch.float64)
+    for i in setting.concerned:
+        mixing[i, (i + 1) % p] = part[i]  # of the next one, whose noise is like its own
+    truth = {f"part_of_{(i + 1) % p + 1}[{i}]": float(part[i]) for i in setting.concerned}
+    return Drawn(CrossTalk(mixing), truth)
 
 
 @draws(ChannelTransfer)

@@ -39,6 +39,7 @@ from gyrofuse.mismatch.mechanisms.signals.tone_amplitude import ToneSize
 from gyrofuse.mismatch.mechanisms.signals.warm_up import Decay, WarmUpTransient
 from gyrofuse.mismatch.mechanisms.slow_remainder import SlowRemainder
 from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
+from gyrofuse.mismatch.mechanisms.spectra.cross_talk import CrossTalk
 from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.notch import NotchFilter
@@ -120,6 +121,7 @@ EVERY = (
     Resonance(MODE),
     DriftingTone(MODE, True, 0.9),
     FlickerNoise(numbers(1 / 3, 0.0)),
+    CrossTalk(torch.tensor([[0.0, 1 / 3], [0.05, 0.0]], dtype=torch.float64)),
     CommonMode("ar1", 0.03, complex_numbers(0.1, 0.2j), BASE, True),
     DeadBand(numbers(0.0, 0.1), numbers(0.2, 0.0), numbers(0.01, 1 / 3)),
     SlowRemainder(

@@ -129,6 +129,15 @@ def test_thinning_makes_up_for_paths_without_weight() -> None:
     assert new.sum(1) == pytest.approx(np.ones(3))
 
 
+def test_thinning_ends_where_as_many_as_are_kept_weigh_the_same() -> None:
+    """The sum of ten equal weights is often a little less than ten of them."""
+    values = np.linspace(0.01, 0.1, 400)
+    weight = np.concatenate([np.repeat(values[:, None], 10, 1), np.zeros((400, 12))], 1)
+    kept, new = _thinned(weight, 10, 0.3)
+    assert (kept == np.arange(10) + 22 * np.arange(400)[:, None]).all()
+    assert np.allclose(new, values[:, None])
+
+
 def test_gains_settle_and_one_is_left_for_the_level_at_the_start() -> None:
     gains, variances = _filter(BACKGROUND, 2000)
     assert gains[0].sum() == pytest.approx(1.0, abs=1e-3)

@@ -193,7 +193,8 @@ def _thinned(weight: Array, n_paths: int, uniform: float) -> tuple[NDArray[np.in
     rounding = 1e-6  # of a path, by which sums of weights may be off
     safe, n_safe = np.zeros(weight.shape, bool), np.zeros((len(weight), 1), int)
     while True:
-        limit = np.where(safe, 0.0, weight).sum(1, keepdims=True) / (n_paths - n_safe) + 1e-300
+        # Where all paths that are kept are above it, it is what the others have together: none of them is.
+        limit = np.where(safe, 0.0, weight).sum(1, keepdims=True) / np.maximum(n_paths - n_safe, 1) + 1e-300
         safe = weight > limit
         now = safe.sum(1, keepdims=True)
         if (now == n_safe).all():

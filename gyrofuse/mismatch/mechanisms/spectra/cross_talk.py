@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.decisions import NATS_AS_GOOD, NATS_PER_NUMBER, NEW_TERM_NATS
+from gyrofuse.mismatch.decisions import NATS_AS_GOOD, NEW_TERM_NATS
 from gyrofuse.mismatch.detectors.spectra.pooled_coherence import common_source
 from gyrofuse.mismatch.likelihoods.declared import declared
 from gyrofuse.mismatch.likelihoods.spectra.coherence import smooth_coherence
@@ -50,7 +51,8 @@ class CrossTalk(Spectral):
         if source is None or source.p_value > level:
             return None
         found = _mixing(comparison, torch.ones(N_JUDGED, dtype=torch.bool))
-        if found.worth < NEW_TERM_NATS or _one_source_does_as_well(comparison, cls(found.matrix), found.worth):
+        effect = cls(found.matrix)
+        if found.worth < NEW_TERM_NATS or (source_first := _source_instead(comparison, effect)) is None:
             return None
         info, parameters = comparison.info, {}
         rows, columns = found.free.nonzero(as_tuple=True)
@@ -61,13 +63,14 @@ class CrossTalk(Spectral):
         sensors = tuple((told | (found.free & ~told & ~told.mT)).any(-1).nonzero()[:, 0].tolist())
         return Finding(
             cls.name,
-            cls(found.matrix),
+            effect,
             f"cross-talk that the simulation does not have, in {info.named(sensors, 'all sensors')}: "
             + _largest(found.matrix, told, info),
             source.p_value,
             sensors,
             parameters,
-            gain=found.gain,
+            alternatives=source_first.names,
+            gain=min(found.gain, source_first.most),
         )
 
     @classmethod
@@ -111,16 +114,31 @@ def _largest(mixing: Tensor, told: Tensor, info: RecordingInfo) -> str:
     )
 
 
-def _one_source_does_as_well(comparison: Comparison, mixing: CrossTalk, worth: float) -> bool:
-    """Whether a source in common, which is simpler, explains what sensors share, on blocks held out as well."""
+class _SourceInstead(NamedTuple):
+    """What a source in common, which is simpler, leaves to be said of cross-talk.
+
+    Attributes:
+        names: Of the source, where it does as well on blocks held out.
+        most: Nats that cross-talk may then count, so that the source is tried first.
+    """
+
+    names: tuple[str, ...] = ()
+    most: float = math.inf
+
+
+def _source_instead(comparison: Comparison, mixing: CrossTalk) -> _SourceInstead | None:
+    """None where a source in common does better."""
     best = leading_shape(comparison)
     if best is None or not best.term.coherent:
-        return False
+        return _SourceInstead()
     source = next((made for kind in declared(Spectral) if (made := kind.from_term(best.term, comparison))), None)
-    if source is None or worth < best.gain - NATS_PER_NUMBER * int(best.term.free.sum()):
-        return True
+    if source is None:
+        return None
     own, other = (_held_out(one, comparison) for one in (mixing, replace(source, company=best.company)))
-    return float((own - other).sum()) < max(2 * sd_of_sum(own - other), NATS_AS_GOOD)
+    more, chance = float((own - other).sum()), max(2 * sd_of_sum(own - other), NATS_AS_GOOD)
+    if more < -chance:
+        return None
+    return _SourceInstead() if more > chance else _SourceInstead((source.name,), best.gain - 1)
 
 
 def _held_out(effect: Spectral, comparison: Comparison) -> Tensor:
