@@ -117,7 +117,7 @@ class CommonMode(Addition):
 
     @classmethod
     def from_term(cls, term: Term, comparison: Comparison) -> CommonMode | None:
-        if not isinstance(term, Common):
+        if not isinstance(term, Common) or term.name != cls.name:  # a bump that sensors share
             return None
         corner = float(term.shared[0].exp()) if term.kind == "ar1" else 0.0
         return cls(term.kind, corner, torch.complex(*term.local), reference_noise(comparison), term.inside)
