@@ -199,7 +199,7 @@ def test_beside_a_sensor_that_jumps_another_one_needs_less() -> None:
     """Of weaker levels, a nat over the Gaussian rival, that would not do alone."""
     comparison, g = telegraph(33), torch.Generator().manual_seed(2033)
     recording = comparison.recording.clone()
-    recording[0] += 0.6 * LEVELS.half * _path(N, LEVELS.up, LEVELS.down, g)
+    recording[0] += 0.55 * LEVELS.half * _path(N, LEVELS.up, LEVELS.down, g)
     both = Comparison.of(SCENE, recording, comparison.reference.signal)
     assert 0 < two_levels(both)[0].over < 1.5
     assert nominated(both, RandomTelegraph).sensors == (0, 1)
