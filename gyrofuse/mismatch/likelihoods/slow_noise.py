@@ -147,7 +147,7 @@ def slow_powers(comparison: Comparison) -> SlowPowers:
     known = side.dof > 0
     every_atom = torch.eye(len(ar1_time_constants(n)) + 3, dtype=torch.float64)  # white, quantisation, AR1s, a walk
     return SlowPowers(
-        torch.cat([side.power[:, known], _simulated_ordinates(comparison)[..., :_UNSEEN].square().mean(0)], -1),
+        torch.cat([side.power[:, known], own_ordinates(comparison, side)[..., :_UNSEEN].square().mean(0)], -1),
         torch.cat(
             [
                 bands.mean_of(NoiseSpectrum(n, every_atom).spectrum(bands.nodes))[:, known],
@@ -265,15 +265,9 @@ def slow_ordinates(signal: Tensor) -> Tensor:
     return ordinates(block_means(signal))
 
 
-def recorded_ordinates(comparison: Comparison) -> Tensor:
-    """Of the recording, `(sensor, ordinate)`, without what its ends let in where the simulation has little else."""
-    y = slow_ordinates(comparison.observed.steady[0])
-    return _without_ends(y) if _ends_let_in(comparison.reference) else y
-
-
-def _simulated_ordinates(comparison: Comparison) -> Tensor:
-    """Likewise of the simulation, `(record, sensor, ordinate)`."""
-    y = slow_ordinates(comparison.reference.steady)
+def own_ordinates(comparison: Comparison, side: Records) -> Tensor:
+    """Of one side, `(record, sensor, ordinate)`, without what its ends let in where the simulation has little else."""
+    y = slow_ordinates(side.steady)
     return _without_ends(y) if _ends_let_in(comparison.reference) else y
 
 

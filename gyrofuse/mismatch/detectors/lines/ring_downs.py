@@ -161,7 +161,6 @@ def _powers(white: Tensor, tau: int) -> Iterator[_Part]:
     taper /= taper.square().sum().sqrt()
     late = 2  # frames: what the start of a record lets in has died away by then, as a tone from then on has not
     frames = white.unfold(-1, length, hop)[:, late:]  # (sensor, frame, time)
-
     some = frames[:, :: -(-frames.shape[1] // most_for_median)]
 
     def transform(part: Tensor, taper: Tensor) -> Tensor:

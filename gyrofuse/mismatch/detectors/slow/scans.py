@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.detectors.result import TestResult
-from gyrofuse.mismatch.likelihoods.slow_noise import Fit, SlowNoise, best_fit, recorded_ordinates, simulated_slow_noise
+from gyrofuse.mismatch.likelihoods.slow_noise import Fit, SlowNoise, best_fit, own_ordinates, simulated_slow_noise
 from gyrofuse.mismatch.likelihoods.slow_templates import Family, declared_families, edges
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
@@ -242,7 +242,7 @@ class SlowAnalysis:
 @derived
 def slow_analysis(comparison: Comparison) -> SlowAnalysis:
     """The slow ordinates of a comparison, with all that mechanisms declare as what may explain them."""
-    noise, y = simulated_slow_noise(comparison), recorded_ordinates(comparison)
+    noise, y = simulated_slow_noise(comparison), own_ordinates(comparison, comparison.observed)[0]
     return SlowAnalysis(noise, y, best_fit(noise, y), declared_families(comparison))
 
 

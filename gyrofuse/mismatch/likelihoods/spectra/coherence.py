@@ -11,6 +11,12 @@ from torch import Tensor
 _ORDINATES = 40  # for each sensor, behind a coherence
 
 
+def coherence_of(matrices: Tensor) -> Tensor:
+    """Coherences of cross-spectra, `(band, sensor, sensor)`."""
+    size = matrices.diagonal(dim1=-2, dim2=-1).real.clamp(min=1e-300).rsqrt()
+    return matrices * (size[:, :, None] * size[:, None, :])
+
+
 def smooth_coherence(coherence: Tensor, dof: Tensor) -> Tensor:
     """Coherence in each band from as many neighbouring ones as an inverse takes, `(band, sensor, sensor)`.
 
@@ -40,8 +46,7 @@ def decorrelated(transform: Tensor, edges: Sequence[int], dof: Tensor) -> Tensor
     """Fourier transform `(sensor, bin)` without the coherence of bands, which are ordinates_to `dof`."""
     parts = [transform[:, a:b] for a, b in itertools.pairwise(edges)]
     matrices = torch.stack([part @ part.mH for part in parts])
-    size = matrices.diagonal(dim1=-1, dim2=-2).real.clamp(min=1e-300).rsqrt()
-    coherence = smooth_coherence(matrices * (size[:, :, None] * size[:, None, :]), dof)
+    coherence = smooth_coherence(coherence_of(matrices), dof)
     roots = torch.linalg.cholesky(coherence)
     solved = [torch.linalg.solve_triangular(r, part, upper=False) for r, part in zip(roots, parts, strict=True)]
     return torch.cat(solved, -1)

@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.decisions import NATS_PER_NUMBER
+from gyrofuse.mismatch.likelihoods.spectra.coherence import coherence_of
 
 
 class Mixing(NamedTuple):
@@ -63,8 +64,7 @@ class _Seen(NamedTuple):
         inverse = torch.linalg.inv(torch.eye(len(matrix), dtype=matrix.dtype) + matrix).to(self.spectra.dtype)
         left = inverse @ self.spectra @ inverse.mT
         power = left.diagonal(dim1=-2, dim2=-1).real.clamp(min=1e-300)
-        size = power.rsqrt()
-        return power, left * size[:, :, None] * size[:, None, :]
+        return power, coherence_of(left)
 
     def log_likelihood(self, matrix: Tensor) -> float:
         """`L`, but for what the coherences of the simulation alone make of it."""

@@ -12,7 +12,7 @@ from torch import Tensor
 from gyrofuse.mismatch.decisions import NATS_AS_GOOD, NEW_TERM_NATS
 from gyrofuse.mismatch.detectors.spectra.pooled_coherence import common_source
 from gyrofuse.mismatch.likelihoods.declared import declared
-from gyrofuse.mismatch.likelihoods.spectra.coherence import smooth_coherence
+from gyrofuse.mismatch.likelihoods.spectra.coherence import coherence_of, smooth_coherence
 from gyrofuse.mismatch.likelihoods.spectra.data import block_spectra
 from gyrofuse.mismatch.likelihoods.spectra.mixing import Mixing, mixing_of
 from gyrofuse.mismatch.mechanisms import pictures
@@ -20,6 +20,7 @@ from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter, Rival
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import leading_shape
 from gyrofuse.mismatch.mechanisms.spectra.spectral import Spectral
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED, in_fold, sd_of_sum
 from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum
@@ -50,7 +51,7 @@ class CrossTalk(Spectral):
         source = common_source(comparison)
         if source is None or source.p_value > level:
             return None
-        found = _mixing(comparison, torch.ones(N_JUDGED, dtype=torch.bool))
+        found = _whole_mixing(comparison)
         effect = cls(found.matrix)
         if found.worth < NEW_TERM_NATS or (source_first := _source_instead(comparison, effect)) is None:
             return None
@@ -77,7 +78,7 @@ class CrossTalk(Spectral):
     def fit_in_place_of(cls, finding: Finding, comparison: Comparison) -> Rival | None:
         if comparison.n_sensors < 2:
             return None
-        found = _mixing(comparison, torch.ones(N_JUDGED, dtype=torch.bool))
+        found = _whole_mixing(comparison)
         return Rival(cls(found.matrix), found.worth) if bool(found.free.any()) else None
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
@@ -148,6 +149,12 @@ def _held_out(effect: Spectral, comparison: Comparison) -> Tensor:
     )
 
 
+@derived
+def _whole_mixing(comparison: Comparison) -> Mixing:
+    """That of the whole recording."""
+    return _mixing(comparison, torch.ones(N_JUDGED, dtype=torch.bool))
+
+
 def _mixing(comparison: Comparison, blocks: Tensor, free: Tensor | None = None) -> Mixing:
     """That of some of the recording's blocks."""
     both, p = block_spectra(comparison), comparison.n_sensors
@@ -158,7 +165,6 @@ def _mixing(comparison: Comparison, blocks: Tensor, free: Tensor | None = None) 
         shared = torch.eye(p, dtype=matrices.dtype).expand_as(matrices)
     else:
         simulated, ordinates = both.reference.mean(torch.ones(N_FOLDS, dtype=torch.bool))
-        size = simulated.diagonal(dim1=-2, dim2=-1).real.clamp(min=1e-300).rsqrt()
-        shared = smooth_coherence(simulated * size[:, :, None] * size[:, None, :], ordinates)
+        shared = smooth_coherence(coherence_of(simulated), ordinates)
         dof = dof * ordinates / (dof + ordinates).clamp(min=1e-300)
     return mixing_of(matrices[known], dof[known], shared[known], free)
