@@ -9,6 +9,7 @@ them; the level of the noise is that of the samples themselves, so that the log 
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,11 +19,10 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy import optimize
+from scipy import fft, optimize
 from torch import Tensor
 
 from gyrofuse.mismatch.likelihoods.noise_near import noise_around
-from gyrofuse.mismatch.signals.lines import with_factors
 from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum
 
 
@@ -49,6 +49,17 @@ class DampedTone(NamedTuple):
         t = torch.arange(n, dtype=torch.float64) + first - self.onset
         angle, decay = 2 * math.pi * self.frequency * t, torch.exp(-t.clamp(min=0) / self.tau) * (t >= 0)
         return torch.stack([decay * angle.cos(), decay * angle.sin()])
+
+    def ordinates(self, first: int, n: int, k: Tensor) -> Tensor:
+        """Orthonormal DCT-II of cosine and sine at `n` samples from a first one on, `(2, k)`, as a geometric series."""
+        turn = cmath.exp(complex(-1 / self.tau, 2 * math.pi * self.frequency))
+        start = max(self.onset - first, 0)
+        theta = math.pi / n * k
+        total = torch.zeros(len(k), dtype=torch.complex128)
+        for angle in (theta, -theta):
+            end = turn ** (n - start) * _turned((n - start) * angle)
+            total += _turned((start + 0.5) * angle) * (1 - end) / (1 - turn * _turned(angle))
+        return torch.view_as_real(turn ** (start + first - self.onset) / math.sqrt(2 * n) * total).mT
 
 
 class FittedTone(NamedTuple):
@@ -97,37 +108,68 @@ class Surroundings:
     @cached_property
     def white(self) -> Tensor:
         """Whitened samples, `(sensor, time)`."""
-        return with_factors(self.samples, self._factors)
+        return torch.from_numpy(fft.idct(self._ordinates.numpy(), norm="ortho", axis=-1))
+
+    @cached_property
+    def _ordinates(self) -> Tensor:
+        """Whitened cosine ordinates, `(sensor, ordinate)`."""
+        return torch.from_numpy(fft.dct(self.samples.numpy(), norm="ortho", axis=-1)) * self._factors
 
     @cached_property
     def _factors(self) -> Tensor:
-        """What whitens cosine ordinates, `(sensor, ordinate)`: the same for all paths that are tried."""
+        """What whitens cosine ordinates, `(sensor, ordinate)`, and takes the mean off."""
         n = self.samples.shape[-1]
         near = torch.nn.functional.interpolate(self.near[:, None], n, mode="linear", align_corners=True)[:, 0]
-        return (self.base.of_ordinates(n) * near).rsqrt()
+        factors = (self.base.of_ordinates(n) * near).rsqrt()
+        factors[:, 0] = 0.0
+        return factors
 
-    def whitened_paths(self, paths: Tensor) -> Tensor:
-        """Paths `(path, time)` as each sensor's whitened samples show them, `(sensor, path, time)`."""
-        n_sensors = len(self.samples)
-        return with_factors(paths[:, None].expand(-1, n_sensors, -1), self._factors).movedim(0, 1)
+    @cached_property
+    def _own(self) -> Tensor:
+        """What is explained, `(sensor, value)`: ordinates, or whitened samples where some are left out."""
+        return self._ordinates if self.keep is None else self.white[:, self.keep]
+
+    def _seen(self, paths: Tensor) -> Tensor:
+        """Paths `(path, time)` as they show there, `(sensor, path, value)`."""
+        seen = torch.from_numpy(fft.dct(paths.numpy(), norm="ortho", axis=-1)) * self._factors[:, None]
+        if self.keep is None:
+            return seen
+        return torch.from_numpy(fft.idct(seen.numpy(), norm="ortho", axis=-1))[..., self.keep]
+
+    def _tone_paths(self, *tones: DampedTone) -> Tensor:
+        """`(path, time)`."""
+        return torch.cat([tone.paths(self.first, self.samples.shape[-1]) for tone in tones])
 
     def regression(self, paths: Tensor) -> tuple[Tensor, Tensor]:
         """Sizes `(path, sensor)` and log likelihood ratios `(sensor,)` of paths `(path, time)`."""
-        y, x = self.white, self.whitened_paths(paths)
-        if self.keep is not None:
-            y, x = y[:, self.keep], x[..., self.keep]
+        return self._regressed(self._own, self._seen(paths))
+
+    def _regressed(self, y: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Of values `(sensor, value)`, all or those that matter, and what paths show there, `(sensor, path, value)`."""
         gram = x @ x.mT
         ridge = 1e-10 * gram.diagonal(dim1=-2, dim2=-1).amax(-1).clamp(min=1e-300)  # of a sine at half the rate
-        gram = gram + ridge[:, None, None] * torch.eye(len(paths), dtype=gram.dtype)
+        gram = gram + ridge[:, None, None] * torch.eye(x.shape[1], dtype=gram.dtype)
         seen = (x @ y[..., None])[..., 0]
         size = torch.linalg.solve(gram, seen)
-        total = y.square().sum(-1)
+        total = self._own.square().sum(-1)
         left = (total - (size * seen).sum(-1)).clamp(min=1e-12 * total)
-        return size.mT, y.shape[-1] / 2 * (total / left).log()
+        return size.mT, self._own.shape[-1] / 2 * (total / left).log()
+
+    def _gain(self, which: list[int], *tones: DampedTone) -> float:
+        """Log likelihood ratio of tones in some sensors, from the ordinates near them."""
+        if self.keep is not None:
+            return float(self.regression(self._tone_paths(*tones))[1][which].sum())
+        n, widths = self.samples.shape[-1], 256  # inverse time constants: all but 1/2500 of a tone's power are nearer
+        near = [(2 * n * tone.frequency, 2 * n * widths / tone.tau) for tone in tones]
+        low, high = min(k - reach for k, reach in near), max(k + reach for k, reach in near)
+        some = slice(max(int(low), 1), min(int(high) + 1, n))
+        k = torch.arange(some.start, some.stop, dtype=torch.float64)
+        paths = torch.cat([tone.ordinates(self.first, n, k) for tone in tones])
+        return float(self._regressed(self._ordinates[:, some], paths * self._factors[:, None, some])[1][which].sum())
 
     def of_tone(self, tone: DampedTone) -> FittedTone:
         """With the sizes that fit best."""
-        return FittedTone(tone, *self.regression(tone.paths(self.first, self.samples.shape[-1])))
+        return FittedTone(tone, *self.regression(self._tone_paths(tone)))
 
     def fitted(self, start: DampedTone, sensors: Sequence[int] | None = None) -> FittedTone:
         """The likeliest onset, frequency and time constant near those of a start, in some sensors or all."""
@@ -145,7 +187,7 @@ class Surroundings:
 
         The log likelihood ratio of both is that of the first; the second has what it adds.
         """
-        which, n, tone = list(sensors), self.samples.shape[-1], start.tone
+        which, tone = list(sensors), start.tone
         onsets = [tone.onset - round(k / 2 * tone.tau) for k in range(-1, 5)]
         step = max(round(tone.tau / 8), 1)
         while True:
@@ -155,21 +197,20 @@ class Surroundings:
                 break
             step, onsets = max(step // 3, 1), [first.onset + k * step for k in (-2, -1, 0, 1, 2)]
             tone = first
-        size, log_ratio = self.regression(torch.cat([one.paths(self.first, n) for one in (first, second)]))
+        size, log_ratio = self.regression(self._tone_paths(first, second))
         alone = self.of_tone(first).log_ratio
         return FittedTone(first, size[:2], log_ratio), FittedTone(second, size[2:], (log_ratio - alone).clamp(min=0))
 
     def _beating(self, tone: DampedTone, which: list[int]) -> tuple[float, DampedTone, DampedTone]:
         """Log likelihood ratio, and frequencies and time constants of two tones at an onset."""
-        n, apart = self.samples.shape[-1], 0.3  # frequencies to begin with, in inverse time constants
+        apart = 0.3  # frequencies to begin with, in inverse time constants
 
         def at(point: NDArray[np.float64]) -> tuple[DampedTone, DampedTone]:
             first, second = (self._moved(tone, float(point[k]), float(point[2 + k])) for k in (0, 1))
             return first, second
 
         def loss(point: NDArray[np.float64]) -> float:
-            paths = torch.cat([one.paths(self.first, n) for one in at(point)])
-            return -float(self.regression(paths)[1][which].sum())
+            return -self._gain(which, *at(point))
 
         start = np.array([-apart / 2, apart / 2, 0.0, 0.0])
         simplex = np.stack(
@@ -181,14 +222,25 @@ class Surroundings:
         return -float(found.fun), *at(found.x)
 
     def refined(self, start: DampedTone, sensors: Sequence[int]) -> FittedTone:
-        """The likeliest frequency and time constant near those of a start, at its onset."""
-        return self.of_tone(self._numbers(start, list(sensors)))
+        """The likeliest frequency and time constant next to those of a start, at its onset: by Gauss and Newton."""
+        best, most = self.of_tone(start), 4  # steps
+        concerned = torch.zeros(len(self.samples), dtype=torch.bool)
+        concerned[list(sensors)] = True
+        for _ in range(most):
+            step = self._step(best._replace(size=best.size * concerned))
+            found = self.of_tone(self._moved(best.tone, float(step[0]), float(step[1])))
+            more = float((found.log_ratio - best.log_ratio)[concerned].sum())
+            if more > 0:
+                best = found
+            if more < 1e-2:  # nats
+                break
+        return best
 
     def _onset(self, tone: DampedTone, which: list[int], reach: int, step: int) -> DampedTone:
         last = self.first + self.samples.shape[-1] - 2
         onsets = {min(max(tone.onset + k, self.first), last) for k in range(-reach, reach + 1, step)}
         tried = [tone._replace(onset=onset) for onset in sorted(onsets)]
-        return max(tried, key=lambda one: self._gain(one, which))
+        return max(tried, key=lambda one: self._gain(which, one))
 
     def _numbers(self, tone: DampedTone, which: list[int]) -> DampedTone:
         """Frequency and time constant, of an onset."""
@@ -198,7 +250,7 @@ class Surroundings:
 
         simplex = np.array([[0.0, 0.0], [0.1, 0.0], [0.0, 0.4]])
         found = optimize.minimize(
-            lambda point: -self._gain(at(point), which),
+            lambda point: -self._gain(which, at(point)),
             simplex[0],
             method="Nelder-Mead",
             options={"initial_simplex": simplex, "maxfev": 60, "xatol": 1e-3, "fatol": 1e-3},
@@ -211,35 +263,43 @@ class Surroundings:
         tau = min(max(tone.tau * math.exp(min(max(factor, -5.0), 5.0)), shortest), longest)
         return tone._replace(frequency=min(max(tone.frequency + by / tone.tau, 0.0), 0.5), tau=tau)
 
-    def _gain(self, tone: DampedTone, which: list[int]) -> float:
-        return float(self.of_tone(tone).log_ratio[which].sum())
-
     def sd(self, found: FittedTone) -> tuple[float, float, Tensor]:
         """Standard deviations of frequency, of the logarithm of the time constant, and of the sizes `(2, sensor)`.
 
         By the information of all numbers together; the onset is taken for known.
         """
-        tone, n = found.tone, self.samples.shape[-1]
-        y, x = self.white, self.whitened_paths(tone.paths(self.first, n))  # (sensor, path, time)
+        covariance, _ = self._information(found)
+        sd = covariance.diagonal().clamp(min=0).sqrt()
+        return float(sd[0] / found.tone.tau), float(sd[1]), sd[2:].view(-1, 2).mT
+
+    def _step(self, found: FittedTone) -> Tensor:
+        """By which frequency, in inverse time constants, and the logarithm of the time constant move; all sizes do."""
+        covariance, score = self._information(found)
+        return (covariance @ score)[:2]
+
+    def _information(self, found: FittedTone) -> tuple[Tensor, Tensor]:
+        """Covariance and score of frequency in inverse time constants, logarithm of the time constant, and sizes."""
+        tone, y, x = found.tone, self._own, self._seen(self._tone_paths(found.tone))  # (sensor, path, value)
         step = 1e-4
         nearby = (
-            (tone._replace(frequency=tone.frequency + step / tone.tau), step / tone.tau),
-            (tone._replace(tau=tone.tau * math.exp(step)), step),
+            tone._replace(frequency=tone.frequency + step / tone.tau),
+            tone._replace(tau=tone.tau * math.exp(step)),
         )
         size = found.size.mT[..., None]  # (sensor, path, 1)
         here = (size * x).sum(1)
-        slopes = [((size * self.whitened_paths(other.paths(self.first, n))).sum(1) - here) / by for other, by in nearby]
-        noise = (y - here).square().mean(-1)
+        slopes = [((size * self._seen(self._tone_paths(other))).sum(1) - here) / step for other in nearby]
+        left = y - here
+        noise = left.square().mean(-1)
         p = len(y)
-        information = torch.zeros(2 + 2 * p, 2 + 2 * p, dtype=torch.float64)
+        information, score = torch.zeros(2 + 2 * p, 2 + 2 * p, dtype=y.dtype), torch.zeros(2 + 2 * p, dtype=y.dtype)
         for i in range(p):
             rows = torch.cat([torch.stack([slope[i] for slope in slopes]), x[i]])
             at = torch.tensor([0, 1, 2 + 2 * i, 3 + 2 * i])
             information[at[:, None], at] += rows @ rows.mT / noise[i]
+            score[at] += rows @ left[i] / noise[i]
         scale = information.diagonal().clamp(min=1e-300).rsqrt()
         covariance = torch.linalg.pinv(information * scale * scale[:, None], hermitian=True) * scale * scale[:, None]
-        sd = covariance.diagonal().clamp(min=0).sqrt()
-        return float(sd[0]), float(sd[1]), sd[2:].view(p, 2).mT
+        return covariance, score
 
     def other_courses(self, found: FittedTone, sensors: Sequence[int]) -> float:
         """Log likelihood ratio of what is no ring-down.
@@ -263,8 +323,12 @@ class Surroundings:
 
         widths = ((1, 0.35), (1, 0.7), (1, 1.4), (2, 0.5), (2, 1.0), (2, 2.0))
         grown = [swelling(k / 2 * tone.tau, power, w * tone.tau) for k in range(-1, 5) for power, w in widths]
-        lasting = _lasting(y * torch.polar(torch.ones_like(angle), -angle))
+        lasting = _lasting(y * _turned(-angle))
         return float(torch.stack([one_sample, step, _louder(y), *grown, lasting]).max())
+
+
+def _turned(angle: Tensor) -> Tensor:
+    return torch.polar(torch.ones_like(angle), angle)
 
 
 def _lasting(turned: Tensor) -> Tensor:
