@@ -8,6 +8,7 @@ import pytest
 import torch
 from bounds import at_most
 from mismatch_draws import normal
+from scipy import signal
 from torch import Tensor
 
 import gyrofuse as gf
@@ -48,6 +49,27 @@ def test_noise_rings_as_often_as_its_p_value_says():
     p_values = [scanned_ring_downs(normal(p, 4096, g=g)).p_value for p in (1, 3) for _ in range(n_runs // 2)]
     for level in (0.1, 0.01):
         assert sum(p < level for p in p_values) <= at_most(n_runs, level)
+
+
+def test_a_line_that_wanders_and_comes_and_goes_is_no_knock_and_hides_none():
+    n, n_runs, alarms = 65536, 8, 0
+    t, steadiness = torch.arange(n, dtype=torch.float64), math.exp(-1 / 500)
+    there = torch.sin(2 * math.pi * t / 8000).clamp(min=0)
+    angle = 2 * math.pi * (0.18 * t + 12.7 * torch.sin(2 * math.pi * t / 11000))  # within 4 % of 0.18
+    since = (t - 20000).clamp(min=0)
+    knock = 1.8 * torch.exp(-since / 300) * torch.sin(2 * math.pi * 0.09 * since)
+    for seed in range(n_runs):
+        g = generator(seed)
+        noise = normal(3, n, g=g)
+        drawn = signal.lfilter([math.sqrt(1 - steadiness**2)], [1, -steadiness], normal(2, n, g=g).numpy())
+        a, b = torch.from_numpy(drawn)
+        noise[2] += 0.6 * there * (a * angle.cos() - b * angle.sin())
+        alarms += scanned_ring_downs(noise).p_value < 0.01
+        noise[1] += knock
+        found = scanned_ring_downs(noise)
+        assert found.p_value < 1e-6
+        assert any(abs(cell.onset - 20000) < 100 and abs(cell.frequency - 0.09) < 0.005 for cell in found.cells[:8])
+    assert alarms <= 3  # where the strong ones of eight spells all come at once, by chance
 
 
 @pytest.mark.parametrize(("frequency", "tau"), [(0.04, 60.0), (0.15, 25.0), (0.33, 120.0), (0.42, 12.0)])

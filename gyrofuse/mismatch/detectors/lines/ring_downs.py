@@ -9,6 +9,8 @@ whose power is `a` times that of the noise has the likelihood ratio
     exp(a / (1 + a) v) / (1 + a)
 
 in each sensor. The mean over cells, sizes and sensors that have it exceeds `x` with probability `1/x` at most.
+
+A line that wanders or comes and goes is as strong in the record run backwards; of a ring-down about half is left there.
 """
 
 from __future__ import annotations
@@ -22,51 +24,13 @@ from torch import Tensor
 
 from gyrofuse._base.transforms import squared_modulus
 from gyrofuse.mismatch.decisions import CHANCE, NATS_AS_GOOD
+from gyrofuse.mismatch.detectors.lines.ring_cells import RingCell, RingScan, apart, irreversible
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.stats.level_scan import local_level, octave_level, octaves
 from gyrofuse.mismatch.stats.multiplicity import e_value_of_some, p_value_beyond_reference
-
-
-class RingCell(NamedTuple):
-    """A cell of time and frequency that stands out.
-
-    Attributes:
-        onset: Sample.
-        frequency: Cycles per sample.
-        tau: Samples.
-        length: Of its window, samples.
-        log_ratio: Logarithm of its likelihood ratio.
-        score: `v` of each sensor, `(sensor,)`.
-    """
-
-    onset: int
-    frequency: float
-    tau: int
-    length: int
-    log_ratio: float
-    score: Tensor
-
-
-class RingScan(NamedTuple):
-    """The mean likelihood ratio of all cells, and those that stand out, the likeliest first.
-
-    Attributes:
-        log_ratio: Logarithm of the mean.
-        n_cells: How many were searched.
-        cells: The likeliest of each stretch of time.
-    """
-
-    log_ratio: float
-    n_cells: int
-    cells: tuple[RingCell, ...]
-
-    @property
-    def p_value(self) -> float:
-        """Ville's bound: medians of frequencies are known to some tenths, and spend what it has to spare."""
-        return math.exp(min(-self.log_ratio, 0.0))
 
 
 def ring_down_test(comparison: Comparison) -> TestResult:
@@ -107,7 +71,12 @@ def _simulated(comparison: Comparison) -> RingScan:
 
 
 def scanned_ring_downs(white: Tensor) -> RingScan:
-    """All ring-downs of whitened samples `(sensor, time)`."""
+    """All ring-downs of whitened samples `(sensor, time)`, without what is as strong in them run backwards."""
+    found = _scanned(white)
+    return found if found.p_value > CHANCE else irreversible(found, _scanned(white.flip(-1)), white.shape[-1])
+
+
+def _scanned(white: Tensor) -> RingScan:
     clip = 4.5  # standard deviations: no spike rings
     white = (white / local_level(white).sqrt()).clamp(-clip, clip)
     white = white.to(torch.float32)  # enough to find a place; numbers are fitted to the samples as they are
@@ -125,7 +94,7 @@ def scanned_ring_downs(white: Tensor) -> RingScan:
             found += part.likeliest(log_ratios, own, frame, place)
         tau *= 2
     found.sort(key=lambda cell: -cell.log_ratio)
-    return RingScan(total - math.log(max(n_cells, 1)), n_cells, tuple(_apart(found)))
+    return RingScan(total - math.log(max(n_cells, 1)), n_cells, tuple(apart(found)))
 
 
 class _Part(NamedTuple):
@@ -146,10 +115,14 @@ class _Part(NamedTuple):
     length: int
 
     def likeliest(self, log_ratios: Tensor, score: Tensor, frame: Tensor, place: Tensor) -> Iterator[RingCell]:
-        """The best of cells `(cell,)`, some dozens of them."""
-        for k in log_ratios.argsort(descending=True).tolist()[:64]:
-            onset, frequency = self.first + int(frame[k]) * self.hop, float(self.lowest + place[k]) / self.length
-            yield RingCell(onset, frequency, self.tau, self.length, float(log_ratios[k]), score[:, k])
+        """The best of cells `(cell,)`, some dozens of each octave: a line that lasts has as many itself."""
+        most = 16
+        best = log_ratios.argsort(descending=True)
+        for octave in octaves(0, self.power.shape[-1]):
+            there = (place[best] >= octave.start) & (place[best] < octave.stop)
+            for k in best[there][:most].tolist():
+                onset, frequency = self.first + int(frame[k]) * self.hop, float(self.lowest + place[k]) / self.length
+                yield RingCell(onset, frequency, self.tau, self.length, float(log_ratios[k]), score[:, k])
 
 
 def _powers(white: Tensor, tau: int) -> Iterator[_Part]:
@@ -223,17 +196,3 @@ def _log_ratios(score: Tensor) -> Tensor:
     sizes = (6.0, 24.0, 96.0)  # power of a ring-down over that of the noise
     each = torch.stack([e_value_of_some(a / (1 + a) * score - math.log1p(a)) for a in sizes])
     return each.logsumexp(0) - math.log(len(sizes))
-
-
-def _apart(cells: list[RingCell]) -> Iterator[RingCell]:
-    """Those that no likelier one comes near to, in time and frequency."""
-    kept: list[RingCell] = []
-    for cell in cells:
-        if not any(_near(cell, other) for other in kept):
-            kept.append(cell)
-            yield cell
-
-
-def _near(cell: RingCell, other: RingCell) -> bool:
-    apart, resolved = abs(cell.frequency - other.frequency), 2 / min(cell.tau, other.tau)
-    return abs(cell.onset - other.onset) < max(cell.length, other.length) and apart < resolved

@@ -1,0 +1,112 @@
+"""Cells of time and frequency in which something seems to ring, and which of them a record run backwards has as well.
+
+A line that wanders or comes and goes is reversible: half of its strongest cells stand out by more in the record run
+backwards. Of a ring-down that has about half of the nats, at the same time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.decisions import NATS_AS_GOOD
+
+
+class RingCell(NamedTuple):
+    """A cell of time and frequency that stands out.
+
+    Attributes:
+        onset: Sample.
+        frequency: Cycles per sample.
+        tau: Samples.
+        length: Of its window, samples.
+        log_ratio: Logarithm of its likelihood ratio.
+        score: `v` of each sensor, `(sensor,)`.
+    """
+
+    onset: int
+    frequency: float
+    tau: int
+    length: int
+    log_ratio: float
+    score: Tensor
+
+
+class RingScan(NamedTuple):
+    """The mean likelihood ratio of all cells, and those that stand out, the likeliest first.
+
+    Attributes:
+        log_ratio: Logarithm of the mean.
+        n_cells: How many were searched.
+        cells: The likeliest of each stretch of time.
+    """
+
+    log_ratio: float
+    n_cells: int
+    cells: tuple[RingCell, ...]
+
+    @property
+    def p_value(self) -> float:
+        """Ville's bound: medians of frequencies are known to some tenths, and spend what it has to spare."""
+        return math.exp(min(-self.log_ratio, 0.0))
+
+
+def apart(cells: list[RingCell]) -> Iterator[RingCell]:
+    """Those that no likelier one comes near to, in time and frequency."""
+    kept: list[RingCell] = []
+    for cell in cells:
+        if not any(_near(cell, other) for other in kept):
+            kept.append(cell)
+            yield cell
+
+
+def _near(cell: RingCell, other: RingCell) -> bool:
+    apart, resolved = abs(cell.frequency - other.frequency), 2 / min(cell.tau, other.tau)
+    return abs(cell.onset - other.onset) < max(cell.length, other.length) and apart < resolved
+
+
+def irreversible(found: RingScan, backwards: RingScan, n_samples: int) -> RingScan:
+    """A scan without cells whose sensor has some of about their frequency that stand out as much backwards.
+
+    Args:
+        found: Scan of a record.
+        backwards: Scan of the record run backwards. Of its cells those count that the record has no stronger one
+            beside, and that last: short ones are clipped, and look alike in both directions.
+        n_samples: Length of the record.
+    """
+    chance, as_strong, near = math.log(found.n_cells) + NATS_AS_GOOD, 0.8, 1 / 4  # nats; of the nats; of a frequency
+    shortest = 64  # samples
+    lasting = [cell for cell in backwards.cells if cell.log_ratio > chance and cell.tau >= shortest]
+    own, back = _Cells.of(found.cells), _Cells.of(lasting)
+    first = n_samples - back.onset - back.length
+    together = (first < (own.onset + own.length)[:, None]) & (first + back.length > own.onset[:, None])
+    reach = torch.maximum(near * own.frequency, 2 / own.tau)[:, None]
+    beside = (back.sensor == own.sensor[:, None]) & ((back.frequency - own.frequency[:, None]).abs() <= reach)
+    mirrored = (together & beside & (own.nats[:, None] >= back.nats)).any(0)
+    near_own = (own.sensor == own.sensor[:, None]) & ((own.frequency - own.frequency[:, None]).abs() <= reach)
+    strongest = torch.where(near_own, own.nats, 0.0).amax(-1, keepdim=True)
+    stays = ~(beside & ~mirrored & (back.nats >= as_strong * strongest)).any(-1)
+    if bool(stays.all()):
+        return found
+    cells = tuple(found.cells[k] for k in stays.nonzero()[:, 0].tolist())
+    return RingScan(float(own.nats[stays].logsumexp(0)) - math.log(found.n_cells), found.n_cells, cells)
+
+
+class _Cells(NamedTuple):
+    """Numbers of cells, `(cell,)` each; the sensor is that with the highest score."""
+
+    onset: Tensor
+    length: Tensor
+    frequency: Tensor
+    tau: Tensor
+    nats: Tensor
+    sensor: Tensor
+
+    @classmethod
+    def of(cls, cells: Sequence[RingCell]) -> _Cells:
+        rows = [(c.onset, c.length, c.frequency, c.tau, c.log_ratio, int(c.score.argmax())) for c in cells]
+        return cls(*torch.tensor(rows, dtype=torch.float64).view(-1, 6).T)
