@@ -3,13 +3,14 @@
 A repaired simulation names them: they act on its noise as they did when they were found. Samples name nothing. Where
 their values lie on a lattice they were rounded, and are again after all that is built into them. What follows a channel
 of the recording, or happens at one of its moments, is looked for in the recording and asked of the simulation: where
-both have it, it is taken off both, so that no more than their difference is found.
+both have it, it is taken off both, so that no more than their difference is found. A noise model follows no channel.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import torch
 from scipy import special
@@ -21,12 +22,18 @@ from gyrofuse.mismatch.repair.repaired_model import RepairedModel
 from gyrofuse.mismatch.selection.held_out import score_held_out
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.folds import N_FOLDS
+from gyrofuse.noise.array_model import ArrayModel
+from gyrofuse.noise.model import Model
 
 _MOST = 6  # effects that a simulation is believed to have
 
 
 def with_own_effects(
-    comparison: Comparison, simulation: object, level: float, generator: torch.Generator
+    comparison: Comparison,
+    simulation: object,
+    level: float,
+    generator: torch.Generator,
+    drawn_with: Sequence[Mechanism] | None = None,
 ) -> tuple[Comparison, tuple[Mechanism, ...]]:
     """The case as far as the simulation's own effects explain it, and these.
 
@@ -37,6 +44,7 @@ def with_own_effects(
         simulation: As it was given.
         level: Largest p value of an effect that is looked for in samples.
         generator: Of what is built into the simulation.
+        drawn_with: Effects that samples are known to have, in their unit; by default they are looked for.
     """
     own: list[Mechanism] = []
     if isinstance(simulation, RepairedModel):
@@ -51,10 +59,20 @@ def with_own_effects(
         if found is not None:
             comparison = found.undo_in_reference(comparison, generator)
             own.append(found)
-    if comparison.reference.signal.shape[-1] == comparison.n_samples:
+    if drawn_with is not None:
+        for effect in drawn_with:
+            if effect.known_path:
+                comparison = _without(comparison, effect)
+                own.append(effect)
+    elif comparison.reference.signal.shape[-1] == comparison.n_samples:
+        follows = not isinstance(simulation, Model | ArrayModel)
         for stage in STAGES:
             kinds = [kind for kind in stage if kind.known_path]
-            while kinds and len(own) < _MOST and (shared := _shared(comparison, kinds, level)):
+            while kinds and len(own) < _MOST:
+                seen = comparison if follows else replace(comparison, info=replace(comparison.info, channels={}))
+                shared = _shared(seen, kinds, level)
+                if shared is None:
+                    break
                 comparison = _without(comparison, shared)
                 own.append(shared)
     return comparison, tuple(own)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 from gyrofuse.io.recording import Recording
 from gyrofuse.mismatch.detectors.tests import TESTS
+from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.repair.inputs import Simulation, modelled, prepared
 from gyrofuse.mismatch.repair.reference_effects import with_own_effects
 from gyrofuse.mismatch.selection.discrepancy import mean_discrepancy
@@ -45,13 +48,19 @@ def discrepancy(
     return mean_discrepancy(compared(given, simulation, generator))
 
 
-def compared(given: Comparison, simulation: object, generator: torch.Generator) -> Comparison:
+def compared(
+    given: Comparison,
+    simulation: object,
+    generator: torch.Generator,
+    drawn_with: Sequence[Mechanism] | None = None,
+) -> Comparison:
     """A case as a discrepancy sees it: without what the simulation itself has of channels and moments.
 
     Args:
         given: Recording and simulation as they came.
         simulation: As it was given.
         generator: Of what is built into the simulation.
+        drawn_with: Effects that samples are known to have; by default they are looked for.
     """
-    start, _ = with_own_effects(given, simulation, sidak_level(_FALSE_ALARM, len(TESTS)), generator)
+    start, _ = with_own_effects(given, simulation, sidak_level(_FALSE_ALARM, len(TESTS)), generator, drawn_with)
     return start

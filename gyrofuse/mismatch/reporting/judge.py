@@ -133,10 +133,10 @@ def judged(
     rate = None if isinstance(judge, Recording) else rate
     lacks: tuple[str, ...] = ()
 
-    def apart(other: Any) -> tuple[Tensor, Comparison]:
+    def apart(other: Any, drawn_with: Sequence[Mechanism] | None = None) -> tuple[Tensor, Comparison]:
         """Discrepancies of the folds, and both sides as they came."""
         given = prepared(judge, other, rate, generator)
-        comparison = compared(given, other, generator)
+        comparison = compared(given, other, generator, drawn_with)
         folds = [discrepancy_of_fold(comparison, fold) for fold in range(N_FOLDS)]
         return torch.tensor(folds, dtype=torch.float64), given
 
@@ -161,10 +161,14 @@ def judged(
         model, lacks = _usable(repaired[0], judge)
         known = _usable(replace(repaired[0], effects=repaired[0].effects[:n_known]), judge)[0]
         for n in range(len(known.effects) + 1, len(model.effects) + 1):
-            after, given = apart(drawn(replace(model, effects=model.effects[:n])))
+            made = replace(model, effects=model.effects[:n])
+            rescaled = any(effect.unit_factor != 1.0 for effect in made.effects)
+            after, given = apart(drawn(made), None if rescaled else made.effects)
             effects.append(model.effects[n - 1])
             courses.append(float(after.mean()))
     auc_after = told(given)
+    if isinstance(judge, Recording):
+        judge = replace(judge, channels={})  # which no other recording follows
     again = [apart(recording) for recording in recordings]
     less = before - after
     helps = float(less.mean()) > _BETTER_SD * float(less.std()) / N_FOLDS**0.5

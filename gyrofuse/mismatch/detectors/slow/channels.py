@@ -86,11 +86,11 @@ def regress(
     y = _lineless_ordinates(comparison) if signal is None else cosine_ordinates(own)
     late = cosine_ordinates(quadrature(rows)) if late_as_well else None
     ordinates = _Ordinates(y[which], cosine_ordinates(rows), late)
-    fit = _fitted(comparison, ordinates, lines, comparison.observed, which)
+    fit = _fitted(comparison, ordinates, comparison.observed, which)
     if fit is not None and fit.p_value < CERTAIN:
         left = own.clone()
         left[which] -= fit.gains @ rows
-        fit = _fitted(comparison, ordinates, lines, replace(comparison.observed, signal=left[None]), which) or fit
+        fit = _fitted(comparison, ordinates, replace(comparison.observed, signal=left[None]), which) or fit
     if fit is None:
         return None
     return replace(fit, gains=fit.gains / size, covariance=fit.covariance / size[:, None, None] / size)
@@ -122,16 +122,22 @@ def _lineless_ordinates(comparison: Comparison) -> Tensor:
     return cosine_ordinates(_lineless(comparison))
 
 
-def _fitted(
-    comparison: Comparison, ordinates: _Ordinates, lines: tuple[float, ...], noise: Records, which: Tensor
-) -> ChannelFit | None:
+@derived
+def _weights(comparison: Comparison) -> Tensor:
+    """Of cosine ordinates, by the simulation's noise, `(sensor, ordinate)`; none beside lines that it has as well."""
+    n = comparison.n_samples
+    k = torch.arange(n, dtype=torch.float64)
+    weights = comparison.base.spectrum((k / (2 * n)).clamp(min=1 / (2 * n))).rsqrt()
+    for f in simulated_lines(comparison.reference):
+        weights[:, (k / 2 - f * n).abs() < 4] = 0.0  # bins of its main lobe
+    return weights
+
+
+def _fitted(comparison: Comparison, ordinates: _Ordinates, noise: Records, which: Tensor) -> ChannelFit | None:
     """Generalised least squares beside a noise of the cross-spectra of `noise`; None where rows are hardly apart."""
     y, a, late = ordinates
     n_sensors, n_rows, n = len(which), len(a), y.shape[-1]
-    k = torch.arange(n, dtype=torch.float64)
-    weights = comparison.base.spectrum((k / (2 * n)).clamp(min=1 / (2 * n)))[which].rsqrt()  # (sensor, ordinate)
-    for f in lines:
-        weights[:, (k / 2 - f * n).abs() < 4] = 0.0  # bins of its main lobe
+    weights = _weights(comparison)[which]
     edges = [1, *(2 * edge for edge in comparison.bands.edges[1:-1]), n]
     moment, moment_late = (torch.zeros(n_sensors * n_rows, dtype=torch.float64) for _ in range(2))
     matrix = torch.zeros(n_sensors * n_rows, n_sensors * n_rows, dtype=torch.float64)
