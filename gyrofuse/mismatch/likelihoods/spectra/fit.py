@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -13,7 +13,14 @@ from torch import Tensor
 from gyrofuse.mismatch.likelihoods.spectra.common_sources import Common
 from gyrofuse.mismatch.likelihoods.spectra.components import Term
 from gyrofuse.mismatch.likelihoods.spectra.noise_parts import Ground
-from gyrofuse.mismatch.likelihoods.spectra.ratios import FLOOR, Ratios, correlations, log_gain, power_scores
+from gyrofuse.mismatch.likelihoods.spectra.ratios import (
+    FLOOR,
+    Ratios,
+    correlations,
+    log_gain,
+    power_gains,
+    power_scores,
+)
 
 
 class Fit(NamedTuple):
@@ -73,15 +80,27 @@ def fit(data: Ratios, terms: Sequence[Term], rounds: int = 40) -> Fit:
     terms = tuple(term.within() for term in terms)
     coherent, added = (any(x) for x in ((t.coherent for t in terms), (t.acts == "add" for t in terms)))
     paired = bool((data.pair_dof > 0).any()) and (coherent or (added and not data.independent))
+    whole = paired or coherent  # else powers are all that is asked for
+
+    def at(terms: Sequence[Term]) -> Tensor:
+        return data_model(data, terms) if whole else pieces(data, terms).power(data)
+
+    def linearised_at(terms: Sequence[Term]) -> tuple[Tensor, Tensor]:
+        return linearised(data, terms) if whole else linearised_powers(data, terms)
+
+    def value_of(model: Tensor, terms: Sequence[Term]) -> float:
+        gain = log_gain(data, model, paired=paired) if whole else power_gains(data, model)
+        return float(gain.sum()) - prior_cost(terms)
+
     free = torch.cat([torch.cat([t.free.flatten(), torch.ones(len(t.shared), dtype=torch.bool)]) for t in terms])
-    model, derivatives = linearised(data, terms)
-    best = _value(data, model, terms, paired)
+    model, derivatives = linearised_at(terms)
+    best = value_of(model, terms)
     damping, information = 1e-3, torch.eye(len(free), dtype=torch.float64)
     for _ in range(rounds if math.isfinite(best) else 1):
         vector = torch.cat([torch.cat([t.local.flatten(), t.shared]) for t in terms])
         limit = torch.cat([part.flatten() for t in terms for part in t.step_limit()])
         precision = torch.cat([_precision(t) for t in terms])
-        information, slope = _power_slopes(data, model, derivatives)
+        information, slope = _power_slopes(data, *(_diagonals(model, derivatives) if whole else (model, derivatives)))
         if paired:
             beside = _wishart_slopes(*_correlated(model, derivatives), correlations(data.observed), data.pair_dof)
             information, slope = information + beside[0], slope + beside[1]
@@ -96,7 +115,7 @@ def fit(data: Ratios, terms: Sequence[Term], rounds: int = 40) -> Fit:
         while damping < 1e8:
             step = _solved(information, slope, active, damping).clamp(-limit, limit)
             trial = _with_numbers(terms, vector + step)
-            value = _value(data, data_model(data, trial), trial, paired)
+            value = value_of(at(trial), trial)
             if value >= best:
                 accepted, gain = True, value - best
                 break
@@ -104,9 +123,11 @@ def fit(data: Ratios, terms: Sequence[Term], rounds: int = 40) -> Fit:
         if not accepted:
             break
         terms, best, damping = trial, value, max(damping / 10, 1e-6)
-        model, derivatives = linearised(data, terms)
+        model, derivatives = linearised_at(terms)
         if gain < enough:
             break
+    if not whole:
+        model = data_model(data, terms)
     information = information[free][:, free]
     rows = torch.where(free, free.cumsum(0) - 1, -1).split([t.local.numel() + len(t.shared) for t in terms])
     if not math.isfinite(best) or not bool(information.isfinite().all()):  # no start to go on from
@@ -114,7 +135,7 @@ def fit(data: Ratios, terms: Sequence[Term], rounds: int = 40) -> Fit:
     covariance = _inverse(information)
     if paired:
         # Powers that a model makes coherent vary together: the scores' own covariance stands between (Godambe).
-        more = _power_covariance(data, model, derivatives) - _power_slopes(data, model, derivatives)[0]
+        more = _power_covariance(data, model, derivatives) - _power_slopes(data, *_diagonals(model, derivatives))[0]
         covariance = covariance + covariance @ more[free][:, free] @ covariance
     gain = float(log_gain(data, model, paired=paired).sum())
     return Fit(terms, gain, information, covariance, rows, model)
@@ -127,10 +148,14 @@ def _inverse(information: Tensor) -> Tensor:
     return inverse * scale[:, None] * scale
 
 
-def _power_slopes(data: Ratios, model: Tensor, derivatives: Tensor) -> tuple[Tensor, Tensor]:
-    """Information `(number, number)` and score `(number,)` of powers."""
-    m = model.diagonal(dim1=-2, dim2=-1).real
-    moved = (derivatives.diagonal(dim1=-2, dim2=-1).real / (m + FLOOR)).flatten(1)  # (number, band * sensor)
+def _diagonals(model: Tensor, derivatives: Tensor) -> tuple[Tensor, Tensor]:
+    """Powers `(band, sensor)` of a model, and their derivatives `(number, band, sensor)`."""
+    return powers(model), powers(derivatives)
+
+
+def _power_slopes(data: Ratios, m: Tensor, derivatives: Tensor) -> tuple[Tensor, Tensor]:
+    """Information `(number, number)` and score `(number,)` of powers `(band, sensor)`."""
+    moved = (derivatives / (m + FLOOR)).flatten(1)  # (number, band * sensor)
     score = (data.weight * power_scores(data, m)).flatten()
     information = (data.weight * data.information[:, None]).flatten()
     return (moved * information) @ moved.mT, moved @ score
@@ -242,11 +267,36 @@ def linearised(data: Ratios, terms: Sequence[Term]) -> tuple[Tensor, Tensor]:
     return model, torch.cat(slopes)
 
 
+def linearised_powers(data: Ratios, terms: Sequence[Term]) -> tuple[Tensor, Tensor]:
+    """Powers of a model without common sources, and their derivatives `(number, band, sensor)`."""
+    parts = pieces(data, terms)
+    power = parts.power(data)
+    own = torch.eye(data.n_sensors, dtype=torch.float64)[:, None]  # (sensor of the number, 1, sensor)
+    slopes = []
+    for term in terms:
+        slope = _differences(data, term, parts, Pieces.power, power)
+        n_local = len(term.local)
+        slopes.append(torch.cat([(slope[:n_local, None] * own).flatten(0, 1), slope[n_local:]]))
+    return power, torch.cat(slopes)
+
+
 _STEP = 1e-4  # of differences, in units of a number: the root of rounding errors, and more
 
 
 def _slopes(data: Ratios, term: Term, parts: Pieces, model: Tensor) -> Tensor:
-    """Derivatives with respect to the numbers of a term, by differences; a local one moves in all sensors at once."""
+    """Derivatives `(number, band, sensor, sensor)` with respect to the numbers of a term."""
+    n_local, p = term.local.shape
+    slope = _differences(data, term, parts, Pieces.model, model)
+    # A number of one sensor acts on its row and column: half the effect that moving all together has on a pair.
+    share = torch.eye(p, dtype=torch.float64)
+    share = (share[:, :, None] + share[:, None, :]) / 2  # (sensor, row, column)
+    return torch.cat([(slope[:n_local, None] * share[:, None]).flatten(0, 1), slope[n_local:]])
+
+
+def _differences(
+    data: Ratios, term: Term, parts: Pieces, made: Callable[[Pieces, Ratios], Tensor], here: Tensor
+) -> Tensor:
+    """Of what is `made` of the pieces and is `here`, over steps of each number; a local one moves in all sensors."""
     (n_local, p), n = term.local.shape, term.local.shape[0] + len(term.shared)
     step = torch.full((n,), _STEP, dtype=torch.float64)
     if term.acts == "add":
@@ -255,11 +305,8 @@ def _slopes(data: Ratios, term: Term, parts: Pieces, model: Tensor) -> Tensor:
     local = term.local + turn[:, :n_local, None].expand(n, n_local, p)
     value = term.values(data.ground, term.local, term.shared)
     moved = term.values(data.ground, local, term.shared + turn[:, n_local:])
-    slope = (parts.with_term(term.acts, moved, value).model(data) - model) / step[:, None, None, None]
-    # A number of one sensor acts on its row and column: half the effect that moving all together has on a pair.
-    share = torch.eye(p, dtype=torch.float64)
-    share = (share[:, :, None] + share[:, None, :]) / 2  # (sensor, row, column)
-    return torch.cat([(slope[:n_local, None] * share[:, None]).flatten(0, 1), slope[n_local:]])
+    difference = made(parts.with_term(term.acts, moved, value), data) - here
+    return difference / step.view(-1, *(1 for _ in here.shape))
 
 
 def _common_slopes(ground: Ground, term: Common, parts: Pieces) -> Tensor:
@@ -271,10 +318,6 @@ def _common_slopes(ground: Ground, term: Common, parts: Pieces) -> Tensor:
         moved = _relative(ground, term.shape(ground, term.shared + turn)) * passed
         slopes = torch.cat([slopes, ((moved - source) / _STEP * term.matrix())[None]])
     return slopes
-
-
-def _value(data: Ratios, model: Tensor, terms: Sequence[Term], paired: bool) -> float:
-    return float(log_gain(data, model, paired=paired).sum()) - prior_cost(terms)
 
 
 def _precision(term: Term) -> Tensor:
