@@ -30,7 +30,7 @@ from gyrofuse.mismatch.likelihoods.spectra.filter_forms import (
     filter_response,
     filter_strength,
 )
-from gyrofuse.mismatch.likelihoods.spectra.fit import _power_slopes, data_model, fit, linearised
+from gyrofuse.mismatch.likelihoods.spectra.fit import _power_slopes, data_model, fit, linearised, linearised_powers
 from gyrofuse.mismatch.likelihoods.spectra.noise_parts import Parts
 from gyrofuse.mismatch.likelihoods.spectra.ratios import FLOOR, Ratios, fitness, log_gain, power_gains
 from gyrofuse.mismatch.likelihoods.spectra.starts import best_bump, best_start
@@ -85,8 +85,11 @@ def test_score_and_information_are_those_of_the_likelihood():
     data = compared(drawn(1, lambda x, g: 1.5 * x, n=4096))
     terms = [LowPass.starts(data.ground, "bilinear")]
     terms = [replace(terms[0], local=terms[0].local[22])]
-    model, slopes = linearised(data, terms)
-    information, score = _power_slopes(data, model, slopes)
+    model, derivatives = linearised(data, terms)
+    power, slopes = linearised_powers(data, terms)
+    for own, of_pairs in ((power, model), (slopes, derivatives)):  # what needs no pairs is the diagonal of what does
+        torch.testing.assert_close(own, of_pairs.diagonal(dim1=-2, dim2=-1).real, rtol=1e-9, atol=1e-9)
+    information, score = _power_slopes(data, power, slopes)
     step = 1e-5
     for i in range(P):
         local = terms[0].local.clone()
@@ -101,7 +104,7 @@ def test_score_and_information_are_those_of_the_likelihood():
     for _ in range(400):
         ratio = torch.from_numpy(g.gamma(d) / d / (g.gamma(s) / s)) * model.diagonal(dim1=-2, dim2=-1).real
         other = replace(data, observed=torch.diag_embed(ratio).to(torch.complex128))
-        drawn_scores.append(_power_slopes(other, model, slopes)[1])
+        drawn_scores.append(_power_slopes(other, power, slopes)[1])
     spread = torch.stack(drawn_scores).var(0)
     torch.testing.assert_close(spread, information.diagonal(), rtol=0.35, atol=0)  # 0.07 each, five of them
 

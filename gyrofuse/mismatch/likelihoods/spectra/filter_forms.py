@@ -128,17 +128,39 @@ def filter_power(kind: str, strength: Tensor, f: Tensor) -> Tensor:
         power = (1 - q).square() / ((1 - q).square() + 4 * q * torch.sin(math.pi * f).square())
         return power if kind == "pole" else power.square()
     if kind in _SAMPLED_MEANS:
-        a = strength[..., None].clamp(min=0).sqrt()
-        images = torch.arange(-16, 17, dtype=f.dtype)  # whose rest is less than a hundredth of the lobes
-        zero = torch.zeros_like(a * f)
-        folded, whole = (
-            sum((torch.sinc(a * (g + k)).abs().pow(2 * _SAMPLED_MEANS[kind]) for k in images.tolist()), zero)
-            for g in (f, torch.zeros_like(f))
-        )
-        return folded / whole
+        a, folded = strength[..., None].clamp(min=0).sqrt(), _one_mean if kind == "integrated" else _two_means
+        return folded(a, f) / folded(a, torch.zeros_like(f[..., :1]))
     if kind in _FORMS and _FORMS[kind].prototype == "butterworth":
         return 1 / (1 + _prototype_frequency(kind, strength, f).pow(2 * _FORMS[kind].order))
     return filter_response(kind, strength, f).abs().square()
+
+
+def _one_mean(a: Tensor, f: Tensor) -> Tensor:
+    """`sum_k sinc(a (f + k))^2`, by Poisson's formula `sum_n (1 - n / a) cos(2 pi f n) / a` over all `-a < n < a`."""
+    last, half = a.ceil() - 1, math.pi * f
+    rise = torch.sin(half)
+    near = rise.abs() < 1e-9
+    over = 1 / torch.where(near, 1.0, rise)
+    alike = torch.where(near, 2 * last + 1, torch.sin((2 * last + 1) * half) * over)
+    weighed = torch.where(near, last, torch.sin(last * half) * over).square()
+    share = (last / a.clamp(min=1e-300)).nan_to_num()
+    folded = ((1 - share) * alike + weighed / a.clamp(min=1e-300)) / a.clamp(min=1e-300)
+    return torch.where(a <= 1, 1.0, folded.clamp(min=0))
+
+
+def _two_means(a: Tensor, f: Tensor) -> Tensor:
+    """`sum_k sinc(a (f + k))^4`; of seven images to either side the rest is less than a hundredth of the lobes."""
+    images, turn = 7, math.pi * a
+    sine, cosine = torch.sin(turn * f), torch.cos(turn * f)
+    total = torch.zeros_like(turn * f)
+    for k in range(-images, images + 1):
+        x = turn * (f + k)
+        near = x.abs() < 1e-9
+        lobe = torch.where(
+            near, 1.0, (sine * torch.cos(turn * k) + cosine * torch.sin(turn * k)) / torch.where(near, 1.0, x)
+        )
+        total += lobe.square().square()
+    return total
 
 
 def filter_response(kind: str, strength: Tensor, f: Tensor) -> Tensor:
