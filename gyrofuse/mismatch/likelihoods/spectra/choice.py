@@ -19,7 +19,7 @@ from gyrofuse.mismatch.likelihoods.spectra.common_sources import Common
 from gyrofuse.mismatch.likelihoods.spectra.components import Term
 from gyrofuse.mismatch.likelihoods.spectra.fit import Fit, data_model, fit, powers, prior_cost
 from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios, correlations, log_gain, power_gains
-from gyrofuse.mismatch.likelihoods.spectra.starts import best_start, candidates
+from gyrofuse.mismatch.likelihoods.spectra.starts import best_start, candidates, levels
 from gyrofuse.mismatch.stats.inclusion import included_sensors
 
 SURE_GAIN = 2.5  # standard deviations from zero of a sensor's gain that it surely has: 1 % by chance
@@ -114,16 +114,10 @@ def _levels_through_filters(data: Ratios) -> list[Fit]:
 
     What a filter passes shows the level: below some frequency, one of a few that its corner may be above.
     """
-    frequency, log_ratio = data.ground.bands.frequency, powers(data.observed).clamp(min=1e-300).log()
-    tried = []
-    for level in candidates(data, [], "scale"):
-        if int(level.free.any(-1).sum()) > 1:
-            continue
-        for below in (0.02, 0.05, 0.12):
-            passed = (frequency > below / 4) & (frequency < below)
-            if not bool(passed.any()):
-                continue
-            start = replace(level, local=log_ratio[passed].mean(0) * level.free)
+    frequency, tried = data.ground.bands.frequency, list[Fit]()
+    for below in (0.02, 0.05, 0.12):
+        passed = (frequency > below / 4) & (frequency < below)
+        for start in levels(data, passed) if bool(passed.any()) else ():
             tried += [fit(data, [start, filtered], _QUICK) for filtered in candidates(data, [start], "filter")]
     likeliest = sorted((f for f in tried if math.isfinite(f.gain)), key=lambda f: -evidence(data, f))[:2]
     return [fit(data, f.terms) for f in likeliest]

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.decisions import NATS_PER_NUMBER
 from gyrofuse.mismatch.likelihoods.spectra.filter_forms import FILTERS, filter_power, strength_of
-from gyrofuse.mismatch.likelihoods.spectra.noise_parts import Ground
+from gyrofuse.mismatch.likelihoods.spectra.noise_parts import Ground, Parts
 from gyrofuse.mismatch.stats.limits import Z
 
 _T = TypeVar("_T", bound="Term")
@@ -114,6 +114,7 @@ class Shift(Term):
 
     Attributes:
         new: Sensors that have no AR1, `(sensor,)`: the level of one comes with a corner.
+        of: Noise whose parts they are, where a filter has changed it since; that of the ground by default.
     """
 
     name: ClassVar[str] = "parameter_shift"
@@ -124,6 +125,7 @@ class Shift(Term):
     apart: ClassVar[bool] = True
 
     new: Tensor | None = None
+    of: Parts | None = None
 
     @classmethod
     def start(cls, ground: Ground) -> Shift:
@@ -162,13 +164,36 @@ class Shift(Term):
                 found.append(replace(one, local=values[:, :, None] * one.free))
         return found
 
+    @classmethod
+    def levels(cls, ground: Ground, log_ratio: Tensor, passed: Tensor) -> list[Shift]:
+        """Single parts at a level, and white noise without the AR1 that stands for its filter.
+
+        Args:
+            ground: Noise of the simulation.
+            log_ratio: Logarithm of the recording's power over it, `(sensor,)`.
+            passed: Bands whose level that is, `(band,)`.
+        """
+        every = cls.start(ground)
+        found = [every.only(every.free & row[:, None]) for row in torch.eye(4, dtype=torch.bool)[[0, 1, 3]]]
+        found = [replace(one, local=log_ratio * one.free) for one in found if bool(one.free.any())]
+        if bool((every.free[0] & every.free[1]).any()):
+            grown = ground.parts.densities[0] + ground.parts.unseen_white[:, None]
+            share = ground.bands.mean_of(grown) / ground.mean  # (sensor, band)
+            white = log_ratio - share[:, passed].clamp(min=1e-9).log().mean(-1)
+            none = torch.full_like(white, -9.0)
+            local = torch.stack([white, none, torch.zeros_like(white), torch.zeros_like(white)])
+            alone = every.only(every.free & torch.tensor([True, True, False, False])[:, None])
+            found.append(replace(alone, local=local * alone.free))
+        return found
+
     @property
     def parts(self) -> Tensor:
         """Which rows of numbers are free in some sensor, `(number,)`."""
         return self.free.any(-1)
 
     def values(self, ground: Ground, local: Tensor, shared: Tensor) -> Tensor:
-        return ground.parts.shifted(local) / ground.density
+        parts = ground.parts if self.of is None else self.of
+        return parts.shifted(local) / parts.densities.sum(0)
 
     def n_free(self, ground: Ground) -> int:
         return int(Shift.start(ground).free[self.parts].sum())

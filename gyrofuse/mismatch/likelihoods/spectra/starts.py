@@ -40,9 +40,20 @@ class SpectralTerms:
         return ()
 
     @classmethod
+    def levels(cls, data: Ratios, passed: Tensor) -> Iterable[Term]:
+        """Terms that set the level of the noise, at those of the recording in bands `(band,)`; none by default."""
+        return ()
+
+    @classmethod
     def forms(cls, data: Ratios, term: Term, company: Sequence[Term]) -> Iterable[Term]:
         """Other forms that one of its terms may have beside the company; none by default."""
         return ()
+
+
+def levels(data: Ratios, passed: Tensor) -> Iterator[Term]:
+    """Levels that a recording's noise may have before a filter which passes some bands `(band,)`."""
+    for kind in declared(SpectralTerms):
+        yield from kind.levels(data, passed)
 
 
 def candidates(data: Ratios, company: Sequence[Term], made_of: str | None = None) -> Iterator[Term]:

@@ -28,11 +28,13 @@ def found(
     frequency_hz: float | None = None,
 ) -> Finding:
     """A finding made of a spectral shape."""
+    # Of several shapes the form of all together is off: the others are yet to be found in the same bands.
+    off = not shape.fits and not shape.company
     limits = {name: entry for name, entry in parameters.items() if not math.isnan(entry.value)}
     return Finding(
         effect.name,
-        replace(effect, company=shape.company, approximate=not shape.fits),
-        sentence if shape.fits else sentence + _of_another_form(shape),
+        replace(effect, company=shape.company, approximate=off),
+        sentence + _of_another_form(shape) if off else sentence,
         shape.p_value,
         sensors,
         limits,

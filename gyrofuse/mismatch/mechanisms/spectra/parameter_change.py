@@ -13,7 +13,8 @@ from torch import Tensor
 
 from gyrofuse.mismatch.detectors.spectra.power_differs import power_differs
 from gyrofuse.mismatch.likelihoods.spectra.components import Shift, Term
-from gyrofuse.mismatch.likelihoods.spectra.data import reference_noise
+from gyrofuse.mismatch.likelihoods.spectra.data import block_spectra, reference_noise
+from gyrofuse.mismatch.likelihoods.spectra.fit import powers
 from gyrofuse.mismatch.likelihoods.spectra.noise_parts import Parts
 from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios
 from gyrofuse.mismatch.likelihoods.spectra.starts import best_start
@@ -62,6 +63,11 @@ class ParameterShift(Filter):
         for one, other in itertools.combinations(starts, 2):
             if not bool((one.free & other.free).any()):
                 yield replace(one, local=one.local + other.local, free=one.free | other.free)
+
+    @classmethod
+    def levels(cls, data: Ratios, passed: Tensor) -> Iterable[Term]:
+        log_ratio = powers(data.observed)[passed].clamp(min=1e-300).log().mean(0)
+        return Shift.levels(data.ground, log_ratio, passed)
 
     @classmethod
     def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
@@ -122,7 +128,8 @@ class ParameterShift(Filter):
         return (parts.shifted(self.log_factors) / parts.densities.sum(0)).sqrt()
 
     def fit_without(self, comparison: Comparison, fold: int) -> Mechanism:
-        term = Shift(self.log_factors, self.log_factors != 0, torch.zeros(0, dtype=torch.float64))
+        parts = Parts(self.base, block_spectra(comparison).bands.nodes)
+        term = Shift(self.log_factors, self.log_factors != 0, torch.zeros(0, dtype=torch.float64), of=parts)
         return replace(self, log_factors=refit(comparison, fold, term, self.company).local)
 
 
