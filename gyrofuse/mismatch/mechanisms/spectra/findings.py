@@ -29,7 +29,7 @@ def found(
 ) -> Finding:
     """A finding made of a spectral shape."""
     # Of several shapes the form of all together is off: the others are yet to be found in the same bands.
-    off = not shape.fits and not shape.company
+    off = not shape.fits and shape.alone
     limits = {name: entry for name, entry in parameters.items() if not math.isnan(entry.value)}
     return Finding(
         effect.name,

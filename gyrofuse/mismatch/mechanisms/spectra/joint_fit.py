@@ -60,6 +60,7 @@ class Shape(NamedTuple):
         explained: Share of the discrepancy of powers beyond chance that all terms of the fit explain, in the sensors
             that have any of them.
         fits: Whether what they leave is no more than chance; else the form is another one.
+        alone: Whether the company adds next to nothing.
     """
 
     term: Term
@@ -74,6 +75,7 @@ class Shape(NamedTuple):
     forms: tuple[Form, ...]
     explained: float
     fits: bool
+    alone: bool
 
 
 def _in_sensors_of(term: Term, rival: Term) -> Term:
@@ -163,7 +165,7 @@ def leading_shape(comparison: Comparison) -> Shape | None:
     if not fits and explained < _LARGELY:
         return None
     seen = [_with_sd(comparison, chosen, i) for i in range(len(chosen.terms))]
-    first, gain = _first(data, chosen, [term for term, _ in seen])
+    first, gain, alone = _first(data, chosen, [term for term, _ in seen])
     term, others = chosen.terms[first], _others(chosen, first)
     n_classes = 16.0  # classes and frequencies that compete
     p = sidak(float(stats.chi2.sf(2 * gain, term.n_free(data.ground))), n_classes)
@@ -187,6 +189,7 @@ def leading_shape(comparison: Comparison) -> Shape | None:
         forms=_forms(data, term, others, chosen.gain),
         explained=explained,
         fits=fits,
+        alone=alone,
     )
 
 
@@ -203,10 +206,11 @@ def _explained(data: Ratios, chosen: Fit) -> tuple[bool, float]:
     return left.p_value > CERTAIN, explained
 
 
-def _first(data: Ratios, chosen: Fit, terms: list[Term]) -> tuple[int, float]:
-    """The term that acts first, and what it adds to the log likelihood of the others, nats.
+def _first(data: Ratios, chosen: Fit, terms: list[Term]) -> tuple[int, float, bool]:
+    """The term that acts first, what it adds to the log likelihood of the others, nats, and whether they add little.
 
-    Not one that gains nothing by itself, nor the little that was left for beside a common source or a mode.
+    Not one that gains nothing by itself unless others need it, nor the little that was left for beside a common source
+    or a mode, or, less yet, beside a filter.
     """
     losses = [chosen.gain]
     if len(terms) > 1:
@@ -215,11 +219,18 @@ def _first(data: Ratios, chosen: Fit, terms: list[Term]) -> tuple[int, float]:
 
     def rank(i: int) -> tuple[bool, int, float]:
         alone = float(log_gain(data, data_model(data, [terms[i]])).sum())
-        little = terms[most].acts != "filter" and losses[i] < losses[most] / 10
-        return alone < NEW_TERM_NATS or little, _ORDER[terms[i].acts], -alone
+        faint = _little(losses[i], losses[most], terms[most])
+        needed = losses[i] > losses[most] / 10
+        return faint or (alone < NEW_TERM_NATS and not needed), _ORDER[terms[i].acts], -alone
 
     first = min(range(len(terms)), key=rank)
-    return first, max(losses[first], 0.0)
+    beside = [_little(losses[i], losses[first], terms[first]) for i in range(len(terms)) if i != first]
+    return first, max(losses[first], 0.0), all(beside)
+
+
+def _little(loss: float, most: float, term: Term) -> bool:
+    """Whether a loss of nats is little beside that of a term."""
+    return loss < most / (100 if term.acts == "filter" else 10)
 
 
 def _rivals(

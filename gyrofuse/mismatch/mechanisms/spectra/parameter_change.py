@@ -20,7 +20,7 @@ from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios
 from gyrofuse.mismatch.likelihoods.spectra.starts import best_start
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Rival
 from gyrofuse.mismatch.mechanisms.spectra.findings import found, spanned
-from gyrofuse.mismatch.mechanisms.spectra.joint_fit import chosen_shape, refit
+from gyrofuse.mismatch.mechanisms.spectra.joint_fit import Shape, chosen_shape, refit
 from gyrofuse.mismatch.mechanisms.spectra.rivals import fit_alone, happened_instead, walks_of
 from gyrofuse.mismatch.mechanisms.spectra.spectral import Filter
 from gyrofuse.mismatch.signals.comparison import Comparison
@@ -105,7 +105,7 @@ class ParameterShift(Filter):
             shape,
             sensors,
             parameters,
-            f"{_said_of(lacking)}: {'; '.join(words) or 'levels differ slightly'}",
+            f"{_said_of(lacking, shape)}: {'; '.join(words) or 'levels differ slightly'}",
         )
 
     @classmethod
@@ -138,8 +138,11 @@ def _start(data: Ratios) -> Term | None:
     return best_start(data, [], Shift.starts(data.ground)[0])[0] if bool(data.ground.matters.any()) else None
 
 
-def _said_of(lacking: Set[str]) -> str:
-    """Whether all kinds of noise that the recording has show in the simulation."""
+def _said_of(lacking: Set[str], shape: Shape) -> str:
+    """Whether all kinds of noise that the recording has show in the simulation, and are what they seem to be."""
+    white, ar1 = shape.term.local[:2]
+    if any(term.acts == "filter" for term in shape.company) and bool(((white > 0) & (ar1 < -1)).any()):
+        return "AR1 noise of the simulation stands for a filter of white noise"
     if not lacking:
         return "the physics is complete, the numbers were wrong"
     return f"the simulation shows no {' and no '.join(sorted(lacking))} where the recording does"
