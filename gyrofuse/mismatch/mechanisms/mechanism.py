@@ -142,8 +142,9 @@ class Mechanism:
         """The comparison with the mechanism in the simulation, whether or not it could be taken off the recording."""
         return comparison.apply(partial(self.apply, info=comparison.info, generator=generator), self.stage)
 
-    def beside_company(self, comparison: Comparison, generator: torch.Generator) -> tuple[Mechanism, Comparison] | None:
-        """The mechanism alone, and the comparison with what it was found beside repaired as well; None by default."""
+    def with_company(self, comparison: Comparison) -> tuple[Mechanism, tuple[Mechanism, ...]]:
+        """The mechanism by itself, and what it was found beside; by default nothing."""
+        return self, ()
 
     def apply_elsewhere(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
         """The comparison of another recording with a simulation that has the mechanism; by default as `repair`.

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 
 from gyrofuse.mismatch.mechanisms.catalogue import STAGES
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, repaired
 from gyrofuse.mismatch.selection.discrepancy import leads_away
 from gyrofuse.mismatch.selection.held_out import HeldOutScore, score_held_out
 from gyrofuse.mismatch.signals.comparison import Comparison
@@ -81,8 +81,8 @@ def _best_of_stage(
             found.append(finding)
     for finding in sorted(found, key=lambda f: -f.gain):
         score = _held(finding, finding.effect, start, comparison, generator)
-        if score is None and (together := finding.effect.beside_company(comparison, generator)) is not None:
-            score = _held(finding, together[0], start, together[1], generator)
+        if score is None:
+            score = _held_in_company(finding, start, comparison, generator)
         if score is not None:
             return Selected(replace(finding, held_out_gain=score.total), comparison, score)
     return None
@@ -96,6 +96,21 @@ def _held(
     if score.confirms(finding.p_value) and not leads_away(start, comparison, score.by_fold, generator):
         return score
     return None
+
+
+def _held_in_company(
+    finding: Finding, start: Comparison, comparison: Comparison, generator: torch.Generator
+) -> HeldOutScore | None:
+    """Its score beside what it was found with, where these hold together: each by itself may lead away."""
+    alone, company = finding.effect.with_company(comparison)
+    if not company:
+        return None
+    score = _held(finding, alone, start, repaired(comparison, company, generator), generator)
+    gained, beside = 0.0, finding.effect.repair(comparison, generator)
+    for effect in company if score is not None else ():
+        gained += score_held_out(beside, effect).total
+        beside = effect.repair(beside, generator)
+    return score if gained > 0 else None
 
 
 def is_known(finding: Finding, known: list[Finding]) -> bool:

@@ -63,7 +63,9 @@ def spectral_gains(
     block = comparison.n_samples // N_JUDGED
     f = torch.arange(block + 1, dtype=torch.float64) / (2 * block)
     f[0] = f[1] / 2  # nothing of a block's mean is in its other ordinates
-    plain = torch.diag_embed(comparison.reference.density(f).mT).to(torch.complex128)
+    # Simple spectra have no stop bands and no zeros. Humps that they lack are nothing to judge others beside.
+    noise = comparison.reference.density(f).minimum(comparison.base.spectrum(f))
+    plain = torch.diag_embed(noise.mT).to(torch.complex128)
     simulated = plain if before is None else before(plain, f)
     after, without = (seen_in_block(matrices.real)[_FIRST:] for matrices in (spectra(plain, f), simulated))
     return _log_scores(left, after, fold) - _log_scores(comparison.recording, without, fold)

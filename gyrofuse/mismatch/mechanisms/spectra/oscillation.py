@@ -66,12 +66,12 @@ class OscillationOnTop(Addition):
 
     mode: Mode
 
-    def beside_company(self, comparison: Comparison, generator: torch.Generator) -> tuple[Mechanism, Comparison] | None:
+    def with_company(self, comparison: Comparison) -> tuple[Mechanism, tuple[Mechanism, ...]]:
         """With levels and filters of the joint fit: of wrong ones a recording may be farther away, with its line in."""
         shape = leading_shape(comparison)
         terms = () if shape is None else (shape.term, *shape.company)
         company = tuple(term for term in terms if not isinstance(term, Peak | CommonBump))
-        return Spectral.beside_company(replace(self, company=company), comparison, generator)
+        return Spectral.with_company(replace(self, company=company), comparison)
 
 
 class Seen(NamedTuple):

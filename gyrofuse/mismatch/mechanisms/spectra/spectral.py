@@ -62,18 +62,13 @@ class Spectral(Mechanism, SpectralTerms):
         """The mechanism that one of its terms stands for; None of another's, by default of any."""
         return None
 
-    def beside_company(self, comparison: Comparison, generator: torch.Generator) -> tuple[Mechanism, Comparison] | None:
-        """With levels and filters that are right only together: each by itself may lead away from the recording."""
+    def with_company(self, comparison: Comparison) -> tuple[Mechanism, tuple[Mechanism, ...]]:
         made = [
             next((effect for kind in declared(Spectral) if (effect := kind.from_term(term, comparison))), None)
             for term in self.company
         ]
-        if not made or None in made:
-            return None
-        for effect in made:
-            assert effect is not None
-            comparison = effect.repair(comparison, generator)
-        return replace(self, company=()), comparison
+        company = tuple(effect for effect in made if effect is not None)
+        return replace(self, company=()), company if len(company) == len(made) else ()
 
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
         return super().held_out_scores(comparison, fold) + slow_gains(comparison, self.spectra, fold)
