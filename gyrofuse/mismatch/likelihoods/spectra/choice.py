@@ -46,8 +46,8 @@ def best_terms(data: Ratios, *, differ: bool) -> Choice:
     for _ in range(most_terms):
         now = list(best.terms) if best else []
         likeliest = _likeliest(data, now)
-        if best is None and differ:
-            likeliest += _levels_through_filters(data)
+        if differ and all(term.acts == "add" for term in now):
+            likeliest += _levels_through_filters(data, now)
         tried = [_varied(data, _pruned(data, f)) for f in likeliest]
         tried = [f for f in tried if evidence(data, f) > value]
         earned = [f for f in tried if best is None or _earned(data, best, f, f.terms[-1])]
@@ -109,8 +109,8 @@ def _likeliest(data: Ratios, company: list[Term]) -> list[Fit]:
     return [_given_over(data, fit(data, f.terms)) for f in kept]
 
 
-def _levels_through_filters(data: Ratios) -> list[Fit]:
-    """Other levels and a filter at once, the likeliest: one by one, an AR1 would stand for both.
+def _levels_through_filters(data: Ratios, company: list[Term]) -> list[Fit]:
+    """Other levels and a filter at once beside what is added, the likeliest: one by one, an AR1 would stand for both.
 
     What a filter passes shows the level: below some frequency, one of a few that its corner may be above.
     """
@@ -118,7 +118,8 @@ def _levels_through_filters(data: Ratios) -> list[Fit]:
     for below in (0.02, 0.05, 0.12):
         passed = (frequency > below / 4) & (frequency < below)
         for start in levels(data, passed) if bool(passed.any()) else ():
-            tried += [fit(data, [start, filtered], _QUICK) for filtered in candidates(data, [start], "filter")]
+            terms = [*company, start]
+            tried += [fit(data, [*terms, filtered], _QUICK) for filtered in candidates(data, terms, "filter")]
     likeliest = sorted((f for f in tried if math.isfinite(f.gain)), key=lambda f: -evidence(data, f))[:2]
     return [fit(data, f.terms) for f in likeliest]
 

@@ -5,16 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.detectors.spectra.frequency_courses import share_of_lorentzian
+from gyrofuse.mismatch.detectors.spectra.frequency_courses import rampless_transform, share_of_lorentzian
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
 from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode, OscillationOnTop, nominated, refitted_mode
 from gyrofuse.mismatch.signals.comparison import Comparison
+from gyrofuse.mismatch.signals.psd import drawn_towards
 from gyrofuse.noise.processes.ar1_recursion import ar1_recursion
 
 if TYPE_CHECKING:
@@ -60,7 +61,7 @@ class DriftingTone(OscillationOnTop):
         if seen is None:
             return None
         mode, finding = seen
-        rate, share = comparison.info.rate, share_of_lorentzian(comparison, finding.peak)
+        rate, share = comparison.info.rate, _share(comparison, mode, share_of_lorentzian(comparison, finding.peak))
         factor = math.sqrt(2 * share)
         return finding.of(
             cls(mode, finding.slow, share),
@@ -98,49 +99,89 @@ class DriftingTone(OscillationOnTop):
         """Its band is filled with the noise around it: another path of its own would differ from the recorded one."""
         signal, n = comparison.recording, comparison.n_samples
         ramp = torch.linspace(0, 1, n, dtype=torch.float64) * (signal[:, -1:] - signal[:, :1])
-        transform = torch.fft.rfft(signal - ramp)
+        band = _Band.of(torch.fft.rfft(signal - ramp), comparison, self.mode)
+        inside = slice(band.first, band.last + 1)
+        parts = torch.randn(2, *band.noise.shape, generator=generator, dtype=torch.float64)
+        filled = torch.complex(parts[0], parts[1]) / math.sqrt(2) * band.noise.sqrt()
+        band.transform[band.concerned, inside] = filled[band.concerned]
+        cleaned = torch.fft.irfft(band.transform, n=n) + ramp
+        return comparison.with_recording(torch.where(band.concerned[:, None], cleaned, signal))
+
+    def fit_without(self, comparison: Comparison, fold: int) -> Mechanism:
+        return replace(self, mode=refitted_mode(comparison, fold, self.mode))
+
+
+class _Band(NamedTuple):
+    """Where a line shows in a record.
+
+    Attributes:
+        transform: Of the record, `(sensor, bin)`.
+        concerned: Sensors that have it, `(sensor,)`; the others stay as they are.
+        first, last: Bins.
+        noise: Power of the noise around it, `(sensor, bin)` from the first to the last.
+    """
+
+    transform: Tensor
+    concerned: Tensor
+    first: int
+    last: int
+    noise: Tensor
+
+    @classmethod
+    def of(cls, transform: Tensor, comparison: Comparison, mode: Mode) -> _Band:
+        n = comparison.n_samples
         bins = torch.arange(n // 2 + 1)
         density = comparison.base.spectrum(bins.clamp(min=1) / n)
-        size = self.mode.gain.abs()
-        concerned = size > _FAINT * size.amax()  # the others stay as they are
+        size = mode.gain.abs()
+        concerned = size > _FAINT * size.amax()
         power = transform.abs().square() / density
-        first, last = self._band(power[concerned], n)
-        middle = round(self.mode.centre * n)
+        first, last = _ends(power[concerned], mode, n)
+        middle = round(mode.centre * n)
         below, above = (max(round(_FLANK * reach), _FEWEST) for reach in (middle - first, last - middle))
         # An octave below at most: what is slower leaks into the slowest ordinates, and is many times the noise there.
         beside = ((bins >= max(first - below, first // 2)) & (bins < first)) | ((bins > last) & (bins <= last + above))
         beside &= bins > 0
         # By the mean logarithm of exponential ordinates: a few that hold more would lift a mean, and all of the band.
         level = (power[:, beside].clamp(min=1e-300).log().mean(-1, keepdim=True) + _EULER).exp()
-        parts = torch.randn(2, len(signal), last - first + 1, generator=generator, dtype=torch.float64)
-        fresh = torch.complex(parts[0], parts[1]) / math.sqrt(2)
-        filled = fresh * (level * density[:, first : last + 1]).sqrt()
-        transform[concerned, first : last + 1] = filled[concerned]
-        cleaned = torch.fft.irfft(transform, n=n) + ramp
-        return comparison.with_recording(torch.where(concerned[:, None], cleaned, signal))
+        return cls(transform, concerned, first, last, level * density[:, first : last + 1])
 
-    def _band(self, power: Tensor, n_samples: int) -> tuple[int, int]:
-        """First and last bin that are cleaned, of powers `(sensor, bin)` in units of the simulation's noise.
 
-        A strong line is seen far beyond the widths of its middle, and none knows how its flanks fall: either end goes
-        on while there is more next to it than farther off, beyond chance.
-        """
-        logs = power.clamp(min=1e-300).log().mean(0)
-        middle, ends = round(self.mode.centre * n_samples), []
-        for side in (logs[1:middle].flip(0), logs[middle + 1 : n_samples // 2]):  # from the centre outwards
-            end = min(max(round(_REACH * self.mode.width * n_samples), 0), len(side))
-            while True:
-                step, far = (max(round(_FLANK * end), least) for least in (_STEP, _FEWEST))
-                near, beyond = side[end : end + step], side[end + step : end + step + far]
-                chance = _SPREAD * math.sqrt(1 / step + 1 / far)
-                if len(beyond) < far or float(near.mean() - beyond.mean()) < _SEEN * chance:
-                    break
-                end += step
-            ends.append(end)
-        return max(middle - ends[0], 1), min(middle + ends[1], n_samples // 2 - 1)
+def _ends(power: Tensor, mode: Mode, n_samples: int) -> tuple[int, int]:
+    """First and last bin of a line, of powers `(sensor, bin)` in units of the simulation's noise.
 
-    def fit_without(self, comparison: Comparison, fold: int) -> Mechanism:
-        return replace(self, mode=refitted_mode(comparison, fold, self.mode))
+    A strong line is seen far beyond the widths of its middle, and none knows how its flanks fall: either end goes on
+    while there is more next to it than farther off, beyond chance.
+    """
+    logs = power.clamp(min=1e-300).log().mean(0)
+    middle, ends = round(mode.centre * n_samples), []
+    for side in (logs[1:middle].flip(0), logs[middle + 1 : n_samples // 2]):  # from the centre outwards
+        end = min(max(round(_REACH * mode.width * n_samples), 0), len(side))
+        while True:
+            step, far = (max(round(_FLANK * end), least) for least in (_STEP, _FEWEST))
+            near, beyond = side[end : end + step], side[end + step : end + step + far]
+            chance = _SPREAD * math.sqrt(1 / step + 1 / far)
+            if len(beyond) < far or float(near.mean() - beyond.mean()) < _SEEN * chance:
+                break
+            end += step
+        ends.append(end)
+    return max(middle - ends[0], 1), min(middle + ends[1], n_samples // 2 - 1)
+
+
+def _share(comparison: Comparison, mode: Mode, expected: float) -> float:
+    """Power of the line over that of the Lorentzian that was fitted to it, by what its band has above the noise.
+
+    Drawn towards what is expected of its form, by as much as chance explains of the difference (Stein).
+    """
+    band = _Band.of(rampless_transform(comparison), comparison, mode)
+    here, n = band.concerned, comparison.n_samples
+    noise = band.noise[here]
+    weight = 1 / noise.mean(-1, keepdim=True)
+    above = (band.transform[here, band.first : band.last + 1].abs().square() - noise) * weight
+    whole = float((mode.gain[here].abs().square()[:, None] * weight).sum()) * n**2 / 2
+    excess = float(above.sum())
+    chance = float(((noise * weight).square()).sum()) + 2 * max(excess, 0.0)
+    measured = drawn_towards(torch.tensor(excess / whole), torch.tensor(chance / whole**2), torch.tensor(expected))
+    return max(float(measured), 0.1)
 
 
 def _wandered(steps: Tensor, phi: float) -> Tensor:
