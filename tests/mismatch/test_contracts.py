@@ -7,7 +7,7 @@ import json
 import math
 import random
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,7 +26,6 @@ from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
 from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
 from gyrofuse.mismatch.mechanisms.signals.tone_amplitude import ToneSize
 from gyrofuse.mismatch.mechanisms.slow_remainder import SlowRemainder
-from gyrofuse.mismatch.mechanisms.spectra.wandering_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.values.stuck_samples import StuckSamples
@@ -68,20 +67,11 @@ VARIANTS = {
 PHYSICS = [kind for kind in CATALOGUE if kind.identified]
 PROMISE_SPECTRA = [kind for kind in CATALOGUE if kind.spectra is not Mechanism.spectra]
 ADD_A_KNOWN_PATH = [kind for kind in CATALOGUE if kind.known_path or kind is SlowRemainder]
-DO_NOT_COVER = {
-    DriftingTone: "amplitudes of tones that wander slowly come out up to a tenth too small: limits hold in 12 of 22",
-}
 QUICK = (UnitScale, Quantization, DeadBand, StuckSamples, VibrationTone)  # diagnosed in a second
 
 
 def name_of(kind: type[Mechanism]) -> str:
     return kind.__name__
-
-
-def but_for(kind: type[Mechanism], known: Mapping[type[Mechanism], str]) -> object:
-    """A mechanism as a parameter of a test; a known failure, with its reason, need not show in few draws."""
-    marks = [pytest.mark.xfail(reason=known[kind], strict=False)] if kind in known else []
-    return pytest.param(kind, marks=marks, id=name_of(kind))
 
 
 every_physics = pytest.mark.parametrize("kind", PHYSICS, ids=name_of)
@@ -310,7 +300,7 @@ def test_limits_are_near_the_truth(kind: type[Mechanism]):
 
 
 @pytest.mark.statistical
-@pytest.mark.parametrize("kind", [but_for(kind, DO_NOT_COVER) for kind in PHYSICS])
+@every_physics
 def test_limits_cover(kind: type[Mechanism], draws: Callable[[int, int], int]):
     """As often as limits that hold in 90 of 100 do in 999 of 1000 studies."""
     drawn = draws(*DRAWN)

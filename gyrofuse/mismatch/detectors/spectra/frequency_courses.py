@@ -49,15 +49,10 @@ def wandering_log_ratio(comparison: Comparison, peak: Oscillation, weights: Tens
     return tone + noise - hump.log_mean
 
 
-def share_of_lorentzian(comparison: Comparison, peak: Oscillation) -> float:
-    """Power of a hump over that of the Lorentzian that was fitted to it.
-
-    A course of frequencies that keeps near its middle has no far tails: a fifth of the power of a Lorentzian of like
-    width and height.
-    """
+def probably_normal(comparison: Comparison, peak: Oscillation) -> float:
+    """Probability that a hump has the shape of a normal law, not a Lorentzian one."""
     bins = _band(comparison, peak, weights_in_phase(comparison, peak))
-    normal = _hump(squared_modulus(bins)).normal if len(bins) >= _FEWEST else 0.5
-    return 1 - normal / 5
+    return _hump(squared_modulus(bins)).normal if len(bins) >= _FEWEST else 0.5
 
 
 @derived

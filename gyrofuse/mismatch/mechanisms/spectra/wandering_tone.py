@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.detectors.spectra.frequency_courses import rampless_transform, share_of_lorentzian
+from gyrofuse.mismatch.detectors.spectra.frequency_courses import probably_normal, rampless_transform
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
 from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode, OscillationOnTop, nominated, refitted_mode
@@ -61,7 +61,7 @@ class DriftingTone(OscillationOnTop):
         if seen is None:
             return None
         mode, finding = seen
-        rate, share = comparison.info.rate, _share(comparison, mode, share_of_lorentzian(comparison, finding.peak))
+        rate, share = comparison.info.rate, _share(comparison, mode, probably_normal(comparison, finding.peak))
         factor = math.sqrt(2 * share)
         return finding.of(
             cls(mode, finding.slow, share),
@@ -167,10 +167,17 @@ def _ends(power: Tensor, mode: Mode, n_samples: int) -> tuple[int, int]:
     return max(middle - ends[0], 1), min(middle + ends[1], n_samples // 2 - 1)
 
 
-def _share(comparison: Comparison, mode: Mode, expected: float) -> float:
+def _share(comparison: Comparison, mode: Mode, normal: float) -> float:
     """Power of the line over that of the Lorentzian that was fitted to it, by what its band has above the noise.
 
-    Drawn towards what is expected of its form, by as much as chance explains of the difference (Stein).
+    Drawn towards what is expected of its form, by as much as chance explains of the difference (Stein): a course of
+    frequencies that keeps near its middle has no far tails, and a fifth less power than a Lorentzian of like width and
+    height.
+
+    Args:
+        comparison: Recording and simulation.
+        mode: Lorentzian.
+        normal: Probability that the line has the shape of a normal law instead.
     """
     band = _Band.of(rampless_transform(comparison), comparison, mode)
     here, n = band.concerned, comparison.n_samples
@@ -180,8 +187,11 @@ def _share(comparison: Comparison, mode: Mode, expected: float) -> float:
     whole = float((mode.gain[here].abs().square()[:, None] * weight).sum()) * n**2 / 2
     excess = float(above.sum())
     chance = float(((noise * weight).square()).sum()) + 2 * max(excess, 0.0)
-    measured = drawn_towards(torch.tensor(excess / whole), torch.tensor(chance / whole**2), torch.tensor(expected))
-    return max(float(measured), 0.1)
+    centre, width = mode.centre * n, mode.width * n
+    inside = (math.atan((centre - band.first) / width) + math.atan((band.last - centre) / width)) / math.pi
+    whole *= 1 - (1 - inside) * (1 - normal)  # a Lorentzian has tails beyond the band
+    measured = torch.tensor(excess / whole, dtype=torch.float64)
+    return max(float(drawn_towards(measured, torch.tensor(chance / whole**2), 1 - normal / 5)), 0.1)
 
 
 def _wandered(steps: Tensor, phi: float) -> Tensor:
