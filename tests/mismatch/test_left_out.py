@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
+import scipy.signal
 import torch
 
 import gyrofuse as gf
@@ -85,3 +86,24 @@ def test_fast_noise_is_described_whatever_the_length(n: int):
     truth, f = gf.AR1(0.338, 1.0), bands(n).frequency
     base = fit_base(truth.spectrum(f)[None], bands(n), n, bands(n).dof)
     assert float((base.spectrum(f)[0] / truth.spectrum(f) - 1).abs().max()) < 0.06
+
+
+@pytest.mark.parametrize(("order", "corner"), [(1, 0.3), (2, 0.25)])
+def test_an_ar1_that_stands_for_a_filter_is_told(order: int, corner: float):
+    """Of a filtered gyroscope a model of white noise, an AR1 and a walk is fitted; a resonance would mend its form."""
+    numerator, denominator = scipy.signal.butter(order, 2 * corner)
+
+    def device(seed: int) -> gf.Recording:
+        drawn = torch.randn(2, 8192, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+        filtered = torch.from_numpy(scipy.signal.lfilter(numerator, denominator, drawn.numpy()))
+        return gf.Recording(filtered, rate=RATE, unit="deg/s")
+
+    fit = gf.fit_gmwm(device(1), "WN + AR1 + RW")
+    simulation = gf.ArrayModel.from_sensors([fit.model.with_params(row) for row in fit.params])
+    report = gf.diagnose(device(2), simulation, judge=device(3))
+    assert [finding.mechanism for finding in report.findings] == ["parameter_shift", "low_pass"]
+    shift, low_pass = report.findings
+    assert shift.sentence.startswith("AR1 noise of the simulation stands for a filter of white noise")
+    assert low_pass.frequency_hz == pytest.approx(corner * RATE, rel=0.05)
+    assert report.judged is not None
+    assert report.judged.after < report.judged.repeatability + 0.5 < report.judged.before

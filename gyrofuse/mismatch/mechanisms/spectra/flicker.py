@@ -77,6 +77,10 @@ class FlickerNoise(Addition):
         )
         return None if found is None else Rival(cls(found[0].local[0]), found[1])
 
+    @classmethod
+    def from_term(cls, term: Term, comparison: Comparison) -> FlickerNoise | None:
+        return cls(term.local[0]) if isinstance(term, Flicker) else None
+
     def explained_by_others(
         self, comparison: Comparison, finding: Finding, beside: Sequence[Finding]
     ) -> tuple[str, ...]:

@@ -150,8 +150,9 @@ def _ends(power: Tensor, mode: Mode, n_samples: int) -> tuple[int, int]:
     """First and last bin of a line, of powers `(sensor, bin)` in units of the simulation's noise.
 
     A strong line is seen far beyond the widths of its middle, and none knows how its flanks fall: either end goes on
-    while there is more next to it than farther off, beyond chance.
+    while there is more next to it than farther off, beyond chance and by a tenth: noise has slopes too.
     """
+    least_more = 0.1  # log power
     logs = power.clamp(min=1e-300).log().mean(0)
     middle, ends = round(mode.centre * n_samples), []
     for side in (logs[1:middle].flip(0), logs[middle + 1 : n_samples // 2]):  # from the centre outwards
@@ -160,7 +161,7 @@ def _ends(power: Tensor, mode: Mode, n_samples: int) -> tuple[int, int]:
             step, far = (max(round(_FLANK * end), least) for least in (_STEP, _FEWEST))
             near, beyond = side[end : end + step], side[end + step : end + step + far]
             chance = _SPREAD * math.sqrt(1 / step + 1 / far)
-            if len(beyond) < far or float(near.mean() - beyond.mean()) < _SEEN * chance:
+            if len(beyond) < far or float(near.mean() - beyond.mean()) < max(_SEEN * chance, least_more):
                 break
             end += step
         ends.append(end)
