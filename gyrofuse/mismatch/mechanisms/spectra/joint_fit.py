@@ -212,25 +212,20 @@ def _first(data: Ratios, chosen: Fit, terms: list[Term]) -> tuple[int, float, bo
     Not one that gains nothing by itself unless others need it, nor the little that was left for beside a common source
     or a mode, or, less yet, beside a filter.
     """
-    losses = [chosen.gain]
+    losses, next_to_nothing = [chosen.gain], 0.01
     if len(terms) > 1:
         losses = [chosen.gain - max(fit(data, _others(chosen, i)).gain, 0.0) for i in range(len(terms))]
     most = max(range(len(terms)), key=lambda i: losses[i])
 
     def rank(i: int) -> tuple[bool, int, float]:
         alone = float(log_gain(data, data_model(data, [terms[i]])).sum())
-        faint = _little(losses[i], losses[most], terms[most])
+        faint = losses[i] < losses[most] * (next_to_nothing if terms[most].acts == "filter" else 0.1)
         needed = losses[i] > losses[most] / 10
         return faint or (alone < NEW_TERM_NATS and not needed), _ORDER[terms[i].acts], -alone
 
     first = min(range(len(terms)), key=rank)
-    beside = [_little(losses[i], losses[first], terms[first]) for i in range(len(terms)) if i != first]
-    return first, max(losses[first], 0.0), all(beside)
-
-
-def _little(loss: float, most: float, term: Term) -> bool:
-    """Whether a loss of nats is little beside that of a term."""
-    return loss < most / (100 if term.acts == "filter" else 10)
+    alone = all(losses[i] < next_to_nothing * losses[first] for i in range(len(terms)) if i != first)
+    return first, max(losses[first], 0.0), alone
 
 
 def _rivals(
