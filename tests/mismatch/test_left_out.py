@@ -104,6 +104,7 @@ def test_an_ar1_that_stands_for_a_filter_is_told(order: int, corner: float):
     assert [finding.mechanism for finding in report.findings] == ["parameter_shift", "low_pass"]
     shift, low_pass = report.findings
     assert shift.sentence.startswith("AR1 noise of the simulation stands for a filter of white noise")
-    assert low_pass.frequency_hz == pytest.approx(corner * RATE, rel=0.05)
+    assert low_pass.frequency_hz == pytest.approx(corner * RATE, rel=0.1)  # beside what is left of the AR1
     assert report.judged is not None
-    assert report.judged.after < report.judged.repeatability + 0.5 < report.judged.before
+    assert report.judged.helps
+    assert report.judged.after < report.judged.before / 3
