@@ -147,10 +147,7 @@ class Mechanism:
         return self, ()
 
     def apply_elsewhere(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
-        """The comparison of another recording with a simulation that has the mechanism; by default as `repair`.
-
-        What has another phase there is applied to the simulation.
-        """
+        """That of another recording with a simulation that has it; what has another phase there is applied to it."""
         return self.repair(comparison, generator)
 
     def spectra(self, matrices: Tensor, f: Tensor) -> Tensor:

@@ -180,6 +180,8 @@ def _share(comparison: Comparison, mode: Mode, normal: float) -> float:
         mode: Lorentzian.
         normal: Probability that the line has the shape of a normal law instead.
     """
+    if not bool(mode.gain.any()):
+        return 1 - normal / 5
     band = _Band.of(rampless_transform(comparison), comparison, mode)
     here, n = band.concerned, comparison.n_samples
     noise = band.noise[here]
