@@ -335,5 +335,6 @@ def _nearest(comparison: Comparison, frequency_hz: float, start: int, stop: int)
     turned = _turned(comparison, frequency_hz / rate)[:, start:stop]
     weights = 1 / _noise_near(comparison, frequency_hz / rate)
     power = (torch.fft.fft(turned, n=padded * n).abs().square() * weights[:, None]).sum(0)
-    near = torch.arange(-bins * padded, bins * padded + 1)
+    reach = min(bins * padded, (padded * n - 1) // 2)  # a spell may be a few samples long
+    near = torch.arange(-reach, reach + 1)
     return frequency_hz + float(near[power[near].argmax()]) / (padded * n) * rate
