@@ -99,12 +99,12 @@ class DriftingTone(OscillationOnTop):
         """Its band is filled with the noise around it: another path of its own would differ from the recorded one."""
         signal, n = comparison.recording, comparison.n_samples
         ramp = torch.linspace(0, 1, n, dtype=torch.float64) * (signal[:, -1:] - signal[:, :1])
-        band = _Band.of(torch.fft.rfft(signal - ramp), comparison, self.mode)
+        band, transform = _Band.of(comparison, self.mode), rampless_transform(comparison).clone()
         inside = slice(band.first, band.last + 1)
         parts = torch.randn(2, *band.noise.shape, generator=generator, dtype=torch.float64)
         filled = torch.complex(parts[0], parts[1]) / math.sqrt(2) * band.noise.sqrt()
-        band.transform[band.concerned, inside] = filled[band.concerned]
-        cleaned = torch.fft.irfft(band.transform, n=n) + ramp
+        transform[band.concerned, inside] = filled[band.concerned]
+        cleaned = torch.fft.irfft(transform, n=n) + ramp
         return comparison.with_recording(torch.where(band.concerned[:, None], cleaned, signal))
 
     def fit_without(self, comparison: Comparison, fold: int) -> Mechanism:
@@ -115,26 +115,26 @@ class _Band(NamedTuple):
     """Where a line shows in a record.
 
     Attributes:
-        transform: Of the record, `(sensor, bin)`.
+        power: Of the record, `(sensor, bin)` from the first to the last.
         concerned: Sensors that have it, `(sensor,)`; the others stay as they are.
         first, last: Bins.
         noise: Power of the noise around it, `(sensor, bin)` from the first to the last.
     """
 
-    transform: Tensor
+    power: Tensor
     concerned: Tensor
     first: int
     last: int
     noise: Tensor
 
     @classmethod
-    def of(cls, transform: Tensor, comparison: Comparison, mode: Mode) -> _Band:
+    def of(cls, comparison: Comparison, mode: Mode) -> _Band:
         n = comparison.n_samples
         bins = torch.arange(n // 2 + 1)
         density = comparison.base.spectrum(bins.clamp(min=1) / n)
         size = mode.gain.abs()
         concerned = size > _FAINT * size.amax()
-        power = transform.abs().square() / density
+        power = rampless_transform(comparison).abs().square() / density
         first, last = _ends(power[concerned], mode, n)
         middle = round(mode.centre * n)
         below, above = (max(round(_FLANK * reach), _FEWEST) for reach in (middle - first, last - middle))
@@ -143,7 +143,8 @@ class _Band(NamedTuple):
         beside &= bins > 0
         # By the mean logarithm of exponential ordinates: a few that hold more would lift a mean, and all of the band.
         level = (power[:, beside].clamp(min=1e-300).log().mean(-1, keepdim=True) + _EULER).exp()
-        return cls(transform, concerned, first, last, level * density[:, first : last + 1])
+        density = density[:, first : last + 1]
+        return cls(power[:, first : last + 1] * density, concerned, first, last, level * density)
 
 
 def _ends(power: Tensor, mode: Mode, n_samples: int) -> tuple[int, int]:
@@ -182,11 +183,11 @@ def _share(comparison: Comparison, mode: Mode, normal: float) -> float:
     """
     if not bool(mode.gain.any()):
         return 1 - normal / 5
-    band = _Band.of(rampless_transform(comparison), comparison, mode)
+    band = _Band.of(comparison, mode)
     here, n = band.concerned, comparison.n_samples
     noise = band.noise[here]
     weight = 1 / noise.mean(-1, keepdim=True)
-    above = (band.transform[here, band.first : band.last + 1].abs().square() - noise) * weight
+    above = (band.power[here] - noise) * weight
     whole = float((mode.gain[here].abs().square()[:, None] * weight).sum()) * n**2 / 2
     excess = float(above.sum())
     chance = float(((noise * weight).square()).sum()) + 2 * max(excess, 0.0)
