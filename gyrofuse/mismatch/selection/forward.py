@@ -106,8 +106,10 @@ def _held_in_company(
     if not company:
         return None
     score = _held(finding, alone, start, repaired(comparison, company, generator), generator)
+    if score is None:
+        return None
     gained, beside = 0.0, finding.effect.repair(comparison, generator)
-    for effect in company if score is not None else ():
+    for effect in company:
         gained += score_held_out(beside, effect).total
         beside = effect.repair(beside, generator)
     return score if gained > 0 else None
