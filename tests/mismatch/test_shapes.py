@@ -30,7 +30,14 @@ from gyrofuse.mismatch.likelihoods.spectra.filter_forms import (
     filter_response,
     filter_strength,
 )
-from gyrofuse.mismatch.likelihoods.spectra.fit import _power_slopes, data_model, fit, linearised, linearised_powers
+from gyrofuse.mismatch.likelihoods.spectra.fit import (
+    _power_slopes,
+    data_model,
+    fit,
+    linearised,
+    pieces,
+    slopes_of_powers,
+)
 from gyrofuse.mismatch.likelihoods.spectra.noise_parts import Parts
 from gyrofuse.mismatch.likelihoods.spectra.ratios import FLOOR, Ratios, fitness, log_gain, power_gains
 from gyrofuse.mismatch.likelihoods.spectra.starts import best_bump, best_start
@@ -86,7 +93,9 @@ def test_score_and_information_are_those_of_the_likelihood():
     terms = [LowPass.starts(data.ground, "bilinear")]
     terms = [replace(terms[0], local=terms[0].local[22])]
     model, derivatives = linearised(data, terms)
-    power, slopes = linearised_powers(data, terms)
+    parts = pieces(data, terms)
+    power = parts.power(data)
+    slopes = slopes_of_powers(data, terms, parts, power)
     for own, of_pairs in ((power, model), (slopes, derivatives)):  # what needs no pairs is the diagonal of what does
         torch.testing.assert_close(own, of_pairs.diagonal(dim1=-2, dim2=-1).real, rtol=1e-9, atol=1e-9)
     information, score = _power_slopes(data, power, slopes)

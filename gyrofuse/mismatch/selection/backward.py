@@ -41,14 +41,17 @@ def eliminate(
     while True:
         selected, comparison, without = _pruned(selected, comparison, generator)
         found = []
-        for k, (one, (score, left)) in enumerate(zip(selected, without, strict=True)):
-            finding = compare(one.finding, score, left, [other.finding for other in selected if other is not one])
-            better = None if swapped else _with_rival(selected[k:], finding, left, level, generator)
-            if better is not None:
-                swapped = True
-                selected, comparison = _repaired(selected[:k], better, one.before, generator)
-                break
-            found.append(one._replace(finding=finding))
+        for one, (score, left) in zip(selected, without, strict=True):
+            beside = [other.finding for other in selected if other is not one]
+            found.append(one._replace(finding=compare(one.finding, score, left, beside)))
+        beaten = None if swapped else _most_beaten([one.finding for one in found])
+        better = None
+        if beaten is not None:
+            k, rival = beaten
+            better = _with_rival(selected[k:], rival, without[k][1], level, generator)
+        if beaten is not None and better is not None:
+            swapped = True
+            selected, comparison = _repaired(selected[:k], better, selected[k].before, generator)
         else:
             lost = _lost([one.finding for one in found], comparison)
             if not lost:
@@ -73,6 +76,25 @@ def same_line(first: Finding, second: Finding, comparison: Comparison) -> bool:
     return abs(first.frequency_hz - second.frequency_hz) < width
 
 
+def _lead_of_rival(finding: Finding) -> float | None:
+    """Nats by which a rival is better, where that is more than chance; None where it is not."""
+    rival, own = finding.instead, finding.gain_without
+    return rival.gain - own if rival is not None and own is not None and rival.beats(own) else None
+
+
+def _most_beaten(findings: list[Finding]) -> tuple[int, str] | None:
+    """Position of the finding whose rival is better by the most nats, and the rival's name; None where none is.
+
+    By more than chance. One search for a rival stands for all: that of each would find the same one again.
+    """
+    leads = [(lead, k) for k, f in enumerate(findings) if (lead := _lead_of_rival(f)) is not None]
+    if not leads:
+        return None
+    _, k = max(leads)
+    rival = findings[k].instead
+    return None if rival is None else (k, rival.mechanism)
+
+
 def _lost(findings: list[Finding], comparison: Comparison) -> list[int]:
     """Positions of findings that lose to a rival by more than chance, and of lines that another one explains."""
     twice = {
@@ -80,11 +102,7 @@ def _lost(findings: list[Finding], comparison: Comparison) -> list[int]:
         for j, k in itertools.combinations(range(len(findings)), 2)
         if same_line(findings[j], findings[k], comparison)
     }
-    beaten = {
-        k
-        for k, f in enumerate(findings)
-        if f.instead is not None and f.gain_without is not None and f.instead.beats(f.gain_without)
-    }
+    beaten = {k for k, f in enumerate(findings) if _lead_of_rival(f) is not None}
     return sorted(beaten | twice)
 
 
@@ -159,23 +177,21 @@ def _repaired(
 
 
 def _with_rival(
-    selected: list[Selected], finding: Finding, left: Comparison, level: float, generator: torch.Generator
+    selected: list[Selected], rival: str, left: Comparison, level: float, generator: torch.Generator
 ) -> list[Finding] | None:
-    """Findings with a rival in the place of the first, if it is better by more than chance, detected, and holds.
+    """Findings with a rival in the place of the first, if it is detected there, and holds.
 
     It comes last, after all that it was found beside. Later findings under its name, which may have mended what the
     first one did not fit, go with that if it scores as much alone.
     """
-    if finding.instead is None or finding.gain_without is None or not finding.instead.beats(finding.gain_without):
-        return None
     first, *later = selected
-    gone = [one for one in later if one.finding.mechanism == finding.instead.mechanism]
+    gone = [one for one in later if one.finding.mechanism == rival]
     rest = [one.finding for one in later if one not in gone]
     least = 0.0
     if gone:
         least = sum((one.score.total for one in gone), first.score.total)
         left = repaired(first.before, rest, generator)
-    for kind in named([finding.instead.mechanism]):
+    for kind in named([rival]):
         found = kind.detect_and_fit(left, level)
         if found is None:
             continue

@@ -82,19 +82,19 @@ def fit(data: Ratios, terms: Sequence[Term], rounds: int = 40) -> Fit:
     paired = bool((data.pair_dof > 0).any()) and (coherent or (added and not data.independent))
     whole = paired or coherent  # else powers are all that is asked for
 
-    def at(terms: Sequence[Term]) -> Tensor:
-        return data_model(data, terms) if whole else pieces(data, terms).power(data)
+    def model_of(parts: Pieces) -> Tensor:
+        return parts.model(data) if whole else parts.power(data)
 
-    def linearised_at(terms: Sequence[Term]) -> tuple[Tensor, Tensor]:
-        return linearised(data, terms) if whole else linearised_powers(data, terms)
+    slopes_at = slopes_of_spectra if whole else slopes_of_powers
 
     def value_of(model: Tensor, terms: Sequence[Term]) -> float:
         gain = log_gain(data, model, paired=paired) if whole else power_gains(data, model)
         return float(gain.sum()) - prior_cost(terms)
 
     free = torch.cat([torch.cat([t.free.flatten(), torch.ones(len(t.shared), dtype=torch.bool)]) for t in terms])
-    model, derivatives = linearised_at(terms)
-    best = value_of(model, terms)
+    parts = pieces(data, terms)
+    model = model_of(parts)
+    derivatives, best = slopes_at(data, terms, parts, model), value_of(model, terms)
     damping, information = 1e-3, torch.eye(len(free), dtype=torch.float64)
     for _ in range(rounds if math.isfinite(best) else 1):
         vector = torch.cat([torch.cat([t.local.flatten(), t.shared]) for t in terms])
@@ -115,15 +115,17 @@ def fit(data: Ratios, terms: Sequence[Term], rounds: int = 40) -> Fit:
         while damping < 1e8:
             step = _solved(information, slope, active, damping).clamp(-limit, limit)
             trial = _with_numbers(terms, vector + step)
-            value = value_of(at(trial), trial)
+            parts = pieces(data, trial)
+            tried = model_of(parts)
+            value = value_of(tried, trial)
             if value >= best:
                 accepted, gain = True, value - best
                 break
             damping *= 10
         if not accepted:
             break
-        terms, best, damping = trial, value, max(damping / 10, 1e-6)
-        model, derivatives = linearised_at(terms)
+        terms, model, best, damping = trial, tried, value, max(damping / 10, 1e-6)
+        derivatives = slopes_at(data, terms, parts, model)
         if gain < enough:
             break
     if not whole:
@@ -200,12 +202,14 @@ class Pieces(NamedTuple):
         added: Densities added.
         filters: Factors on everything.
         common: Cross-spectra of common sources over the reference's powers, `(band, sensor, sensor)`.
+        values: What each term does, in the order of the terms; of a common source its cross-spectra.
     """
 
     factor: Tensor
     added: Tensor
     filters: Tensor
     common: Tensor
+    values: tuple[Tensor, ...] = ()
 
     def with_term(self, acts: str, values: Tensor, instead: Tensor | float | None = None) -> Pieces:
         """With one more term that acts in some way; or with other `values` of one that is there, `instead`."""
@@ -240,14 +244,16 @@ def pieces(data: Ratios, terms: Sequence[Term]) -> Pieces:
     """What terms do to the reference's noise."""
     ground = data.ground
     one = torch.ones_like(ground.density)
-    found = Pieces(one, torch.zeros_like(one), one, torch.zeros_like(data.expected))
+    found, values = Pieces(one, torch.zeros_like(one), one, torch.zeros_like(data.expected)), list[Tensor]()
     for term in terms:
         if isinstance(term, Common):
-            source = _relative(ground, term.shape(ground, term.shared)) * term.matrix()
-            found = found._replace(common=found.common + source)
+            made = _relative(ground, term.shape(ground, term.shared)) * term.matrix()
+            found = found._replace(common=found.common + made)
         else:
-            found = found.with_term(term.acts, term.values(ground, term.local, term.shared))
-    return found
+            made = term.values(ground, term.local, term.shared)
+            found = found.with_term(term.acts, made)
+        values.append(made)
+    return found._replace(values=tuple(values))
 
 
 def _relative(ground: Ground, density: Tensor) -> Tensor:
@@ -257,36 +263,41 @@ def _relative(ground: Ground, density: Tensor) -> Tensor:
 
 
 def linearised(data: Ratios, terms: Sequence[Term]) -> tuple[Tensor, Tensor]:
-    """Model and its derivatives `(number, band, sensor, sensor)` with respect to every number, free or not."""
+    """Model and its derivatives `(number, band, sensor, sensor)` with respect to every number."""
     parts = pieces(data, terms)
     model = parts.model(data)
+    return model, slopes_of_spectra(data, terms, parts, model)
+
+
+def slopes_of_spectra(data: Ratios, terms: Sequence[Term], parts: Pieces, model: Tensor) -> Tensor:
+    """Derivatives `(number, band, sensor, sensor)` of a model with respect to the numbers of its terms."""
     slopes = [
-        _common_slopes(data.ground, t, parts) if isinstance(t, Common) else _slopes(data, t, parts, model)
-        for t in terms
+        _common_slopes(data.ground, term, parts)
+        if isinstance(term, Common)
+        else _slopes(data, term, value, parts, model)
+        for term, value in zip(terms, parts.values, strict=True)
     ]
-    return model, torch.cat(slopes)
+    return torch.cat(slopes)
 
 
-def linearised_powers(data: Ratios, terms: Sequence[Term]) -> tuple[Tensor, Tensor]:
-    """Powers of a model without common sources, and their derivatives `(number, band, sensor)`."""
-    parts = pieces(data, terms)
-    power = parts.power(data)
+def slopes_of_powers(data: Ratios, terms: Sequence[Term], parts: Pieces, power: Tensor) -> Tensor:
+    """Derivatives `(number, band, sensor)` of powers of a model without common sources."""
     own = torch.eye(data.n_sensors, dtype=torch.float64)[:, None]  # (sensor of the number, 1, sensor)
     slopes = []
-    for term in terms:
-        slope = _differences(data, term, parts, Pieces.power, power)
+    for term, value in zip(terms, parts.values, strict=True):
+        slope = _differences(data, term, value, parts, Pieces.power, power)
         n_local = len(term.local)
         slopes.append(torch.cat([(slope[:n_local, None] * own).flatten(0, 1), slope[n_local:]]))
-    return power, torch.cat(slopes)
+    return torch.cat(slopes)
 
 
 _STEP = 1e-4  # of differences, in units of a number: the root of rounding errors, and more
 
 
-def _slopes(data: Ratios, term: Term, parts: Pieces, model: Tensor) -> Tensor:
-    """Derivatives `(number, band, sensor, sensor)` with respect to the numbers of a term."""
+def _slopes(data: Ratios, term: Term, value: Tensor, parts: Pieces, model: Tensor) -> Tensor:
+    """Derivatives `(number, band, sensor, sensor)` with respect to the numbers of a term of that value."""
     n_local, p = term.local.shape
-    slope = _differences(data, term, parts, Pieces.model, model)
+    slope = _differences(data, term, value, parts, Pieces.model, model)
     # A number of one sensor acts on its row and column: half the effect that moving all together has on a pair.
     share = torch.eye(p, dtype=torch.float64)
     share = (share[:, :, None] + share[:, None, :]) / 2  # (sensor, row, column)
@@ -294,19 +305,24 @@ def _slopes(data: Ratios, term: Term, parts: Pieces, model: Tensor) -> Tensor:
 
 
 def _differences(
-    data: Ratios, term: Term, parts: Pieces, made: Callable[[Pieces, Ratios], Tensor], here: Tensor
+    data: Ratios, term: Term, value: Tensor, parts: Pieces, made: Callable[[Pieces, Ratios], Tensor], here: Tensor
 ) -> Tensor:
-    """Of what is `made` of the pieces and is `here`, over steps of each number; a local one moves in all sensors."""
-    (n_local, p), n = term.local.shape, term.local.shape[0] + len(term.shared)
-    step = torch.full((n,), _STEP, dtype=torch.float64)
+    """Of what is `made` of the pieces and is `here`, over steps of each number that is free in some sensor, else 0.
+
+    A local number moves in all sensors.
+    """
+    n_local, p = term.local.shape
+    step = torch.full((n_local + len(term.shared),), _STEP, dtype=torch.float64)
     if term.acts == "add":
         step[:n_local] *= term.local.abs().amax(-1).clamp(min=1e-30)
-    turn = torch.diag(step)
-    local = term.local + turn[:, :n_local, None].expand(n, n_local, p)
-    value = term.values(data.ground, term.local, term.shared)
+    free = torch.cat([term.free.any(-1), torch.ones(len(term.shared), dtype=torch.bool)])
+    turn = torch.diag(step)[free]
+    local = term.local + turn[:, :n_local, None].expand(-1, n_local, p)
     moved = term.values(data.ground, local, term.shared + turn[:, n_local:])
     difference = made(parts.with_term(term.acts, moved, value), data) - here
-    return difference / step.view(-1, *(1 for _ in here.shape))
+    slopes = torch.zeros(len(step), *here.shape, dtype=here.dtype)
+    slopes[free] = difference / step[free].view(-1, *(1 for _ in here.shape))
+    return slopes
 
 
 def _common_slopes(ground: Ground, term: Common, parts: Pieces) -> Tensor:
