@@ -91,7 +91,7 @@ def test_score_and_information_are_those_of_the_likelihood():
     """Score by differences of the log likelihood; information as the mean of the curvature under the model."""
     data = compared(drawn(1, lambda x, g: 1.5 * x, n=4096))
     terms = [LowPass.starts(data.ground, "bilinear")]
-    terms = [replace(terms[0], local=terms[0].local[22])]
+    terms = [replace(terms[0], local=terms[0].local[22].expand(1, P))]
     model, derivatives = linearised(data, terms)
     parts = pieces(data, terms)
     power = parts.power(data)
@@ -204,7 +204,7 @@ def shape_examples(data: Ratios) -> list[Term]:
     common = Common.start(ground, data.observed - data.expected, data.information, "ar1", tensor(0.01).log())
     return [
         Shift.start(ground),
-        replace(LowPass.starts(ground, "pole"), local=LowPass.starts(ground, "pole").local[22]),
+        replace(LowPass.starts(ground, "pole"), local=LowPass.starts(ground, "pole").local[22].expand(1, P)),
         Flicker.start(ground),
         PowerLaw.like(Flicker.start(ground), ground),
         common,
@@ -356,11 +356,11 @@ def test_a_walk_that_was_not_seen_may_grow():
     # Without it a walk could not be other numbers of noise that has none.
     walk = 3e-5 * torch.randn(P, N, generator=g, dtype=torch.float64).cumsum(-1)
     data = compared(comparison(given.recording + walk, given.reference.signal))
-    start = best_start(data, [], Shift.starts(data.ground)[0])[0]
+    start = best_start(data, pieces(data, []), Shift.starts(data.ground)[0])[0]
     assert start.free[3].all()
     # From where the search starts a walk; an AR1 that was not seen either would do nearly as well.
     white = start.free & torch.tensor([True, False, False, False])[:, None]
-    walking = best_start(data, [], Shift.starts(data.ground)[-1])[0]
+    walking = best_start(data, pieces(data, []), Shift.starts(data.ground)[-1])[0]
     gains = [fit(data, [term]).gain for term in (replace(walking, free=walking.free | white), start.only(white))]
     assert gains[0] > 70 + gains[1]
     # How much of it there was is not said.
@@ -464,7 +464,7 @@ def test_fits_of_nothing_gain_what_chance_gives():
     gains = []
     for s in range(12):
         data = compared(drawn(400 + s))
-        gains.append(2 * fit(data, [best_start(data, [], LowPass.starts(data.ground, "pole"))[0]]).gain)
+        gains.append(2 * fit(data, [best_start(data, pieces(data, []), LowPass.starts(data.ground, "pole"))[0]]).gain)
     # Half the sensors' estimates would be negative: at most chi-square with as many numbers.
     assert float(np.mean(gains)) < P + 4 * math.sqrt(2 * P / 12)
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from gyrofuse.mismatch.decisions import NATS_AS_GOOD, NATS_PER_NUMBER, NEW_TERM_NATS
 from gyrofuse.mismatch.likelihoods.spectra.common_sources import Common
 from gyrofuse.mismatch.likelihoods.spectra.components import Term
-from gyrofuse.mismatch.likelihoods.spectra.fit import Fit, data_model, fit, powers, prior_cost
+from gyrofuse.mismatch.likelihoods.spectra.fit import Fit, data_model, fit, pieces, powers, prior_cost
 from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios, correlations, log_gain, power_gains
 from gyrofuse.mismatch.likelihoods.spectra.starts import best_start, candidates, levels
 from gyrofuse.mismatch.stats.inclusion import included_sensors
@@ -114,12 +114,14 @@ def _levels_through_filters(data: Ratios, company: list[Term]) -> list[Fit]:
 
     What a filter passes shows the level: below some frequency, one of a few that its corner may be above.
     """
-    frequency, tried = data.ground.bands.frequency, list[Fit]()
+    frequency, starts, n_fitted = data.ground.bands.frequency, list[list[Term]](), 8
     for below in (0.02, 0.05, 0.12):
         passed = (frequency > below / 4) & (frequency < below)
         for start in levels(data, passed) if bool(passed.any()) else ():
             terms = [*company, start]
-            tried += [fit(data, [*terms, filtered], _QUICK) for filtered in candidates(data, terms, "filter")]
+            starts += [[*terms, filtered] for filtered in candidates(data, terms, "filter")]
+    starts.sort(key=lambda terms: -float(power_gains(data, pieces(data, terms).power(data)).sum()))
+    tried = [fit(data, terms, _QUICK) for terms in starts[:n_fitted]]
     likeliest = sorted((f for f in tried if math.isfinite(f.gain)), key=lambda f: -evidence(data, f))[:2]
     return [fit(data, f.terms) for f in likeliest]
 
@@ -161,7 +163,7 @@ def _given_over(data: Ratios, found: Fit) -> Fit:
     if not bool(mine.any()) or not all(bool(t.free.any()) for t in fewer):
         return found
     grid = last.grid(data.ground)
-    start = last if grid is None else best_start(data, fewer, grid)[0].only(last.free)
+    start = last if grid is None else best_start(data, pieces(data, fewer), grid)[0].only(last.free)
     tried = fit(data, [*fewer, start])
     return max(found, tried, key=lambda f: evidence(data, f))
 

@@ -229,10 +229,9 @@ class LowPass(Term):
 
     @classmethod
     def starts(cls, ground: Ground, kind: str) -> LowPass:
-        """Corners to start from: all in one, `local` is `(start, 1, sensor)`."""
+        """Corners to start from: all in one, `local` is `(start, 1, 1)`."""
         numbers = torch.linspace(math.log(0.012), math.log(100), 37, dtype=torch.float64)
-        local = numbers[:, None, None].expand(-1, 1, len(ground.mean)).clone()
-        return cls(local, torch.ones(1, len(ground.mean), dtype=torch.bool), NO_SHARED, kind)
+        return cls(numbers[:, None, None], torch.ones(1, len(ground.mean), dtype=torch.bool), NO_SHARED, kind)
 
     def grid(self, ground: Ground) -> LowPass:
         return type(self).starts(ground, self.kind)

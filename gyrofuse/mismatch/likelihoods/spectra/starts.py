@@ -16,7 +16,7 @@ from torch import Tensor
 from gyrofuse.mismatch.likelihoods.declared import declared
 from gyrofuse.mismatch.likelihoods.spectra.common_sources import Common, CommonBump
 from gyrofuse.mismatch.likelihoods.spectra.components import Peak, Term, oscillation
-from gyrofuse.mismatch.likelihoods.spectra.fit import data_model, pieces, powers
+from gyrofuse.mismatch.likelihoods.spectra.fit import Pieces, data_model, pieces, powers
 from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios, log_gain, power_gains
 
 
@@ -69,24 +69,36 @@ def other_forms(data: Ratios, term: Term, company: Sequence[Term]) -> Iterator[T
         yield from kind.forms(data, term, company)
 
 
-def closer_start(data: Ratios, company: Sequence[Term], family: Term) -> tuple[Term, float]:
-    """The same as `best_start` of an even grid of one local number, in ever finer grids, each sensor's by itself."""
-    rounds, beside = 3, torch.linspace(-1, 1, 9, dtype=torch.float64)[:, None, None]
-    step = float(family.local[:2, 0, 0].diff())
-    start, gain = best_start(data, company, family)
-    for _ in range(rounds):
-        start, gain = best_start(data, company, replace(family, local=start.local + step * beside))
-        step *= float(beside[1] - beside[0])
-    return replace(family, local=start.local), gain
+def best_start(data: Ratios, beside: Pieces, family: Term) -> tuple[Term, float]:
+    """Of starts `local` `(start, number, sensor or 1)` the likeliest in each sensor, and its gain, nats.
 
-
-def best_start(data: Ratios, company: Sequence[Term], family: Term) -> tuple[Term, float]:
-    """Of starts `local` `(start, number, sensor)` the likeliest in each sensor beside others, and its gain, nats."""
+    Args:
+        data: What is to be explained.
+        beside: What other terms do.
+        family: The starts.
+    """
     values = family.values(data.ground, family.local, family.shared)  # (start, sensor, node)
-    gains = power_gains(data, pieces(data, company).with_term(family.acts, values).power(data)).sum(-2)
-    best = gains.argmax(0)
-    local = family.local.gather(0, best[None, None].expand(1, *family.local.shape[1:]))[0]
+    gains = power_gains(data, beside.with_term(family.acts, values).power(data)).sum(-2)
+    best, local = gains.argmax(0), family.local.expand(-1, -1, data.n_sensors)
+    local = local.gather(0, best[None, None].expand(1, *local.shape[1:]))[0]
     return replace(family, local=local), float(gains.amax(0).clamp(min=0).sum())
+
+
+def closest_starts(data: Ratios, beside: Pieces, families: Sequence[Term]) -> list[Term]:
+    """Of families on even grids of one local number the likeliest starts, each sensor's by itself, the likeliest first.
+
+    In ever finer grids, of which a family that is far behind in a coarser one gets none: the misfit of a step falls
+    with its square.
+    """
+    finer, beside_it = (len(families), 8, 5), torch.linspace(-1, 1, 9, dtype=torch.float64)[:, None, None]
+    steps = [float(family.local[:2, 0, 0].diff()) for family in families]
+    found = [(best_start(data, beside, family), step) for family, step in zip(families, steps, strict=True)]
+    for n_kept in finer:
+        found.sort(key=lambda entry: -entry[0][1])
+        for k, ((start, _), step) in enumerate(found[:n_kept]):
+            closer = replace(start, local=start.local + step * beside_it)
+            found[k] = best_start(data, beside, closer), step * float(beside_it[1] - beside_it[0])
+    return [start for (start, _), _ in sorted(found, key=lambda entry: -entry[0][1])]
 
 
 def common_starts(data: Ratios, company: Sequence[Term]) -> Iterator[Common]:

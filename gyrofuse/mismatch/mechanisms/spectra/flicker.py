@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.likelihoods.spectra.components import Flicker, Term
+from gyrofuse.mismatch.likelihoods.spectra.fit import pieces
 from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios
 from gyrofuse.mismatch.likelihoods.spectra.starts import best_start
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Rival
@@ -44,7 +45,7 @@ class FlickerNoise(Addition):
     def starts(cls, data: Ratios, company: Sequence[Term]) -> Iterable[Term]:
         if any(isinstance(term, Flicker) for term in company):
             return ()
-        return (best_start(data, company, Flicker.starts(data.ground))[0],)
+        return (best_start(data, pieces(data, company), Flicker.starts(data.ground))[0],)
 
     @classmethod
     def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
@@ -73,7 +74,7 @@ class FlickerNoise(Addition):
     @classmethod
     def fit_in_place_of(cls, finding: Finding, comparison: Comparison) -> Rival | None:
         found = fit_alone(
-            comparison, finding.sensors, lambda data: best_start(data, [], Flicker.starts(data.ground))[0]
+            comparison, finding.sensors, lambda data: best_start(data, pieces(data, []), Flicker.starts(data.ground))[0]
         )
         return None if found is None else Rival(cls(found[0].local[0]), found[1])
 

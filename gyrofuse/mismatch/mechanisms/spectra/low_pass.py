@@ -17,8 +17,9 @@ from gyrofuse.mismatch.likelihoods.spectra.filter_forms import (
     filter_response,
     strength_of,
 )
+from gyrofuse.mismatch.likelihoods.spectra.fit import pieces
 from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios
-from gyrofuse.mismatch.likelihoods.spectra.starts import closer_start
+from gyrofuse.mismatch.likelihoods.spectra.starts import closest_starts
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter, Rival
 from gyrofuse.mismatch.mechanisms.spectra.findings import found
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import chosen_shape, refit
@@ -118,13 +119,9 @@ class LowPassFilter(Filter):
 
 
 def filter_starts(data: Ratios, company: Sequence[Term]) -> list[LowPass]:
-    """Every form of a filter at its likeliest corners, the likeliest first.
-
-    Of strong filters a coarse grid of corners would decide between the forms.
-    """
-    found = [closer_start(data, company, LowPass.starts(data.ground, kind)) for kind in FILTERS]
-    found.sort(key=lambda entry: -entry[1])
-    return [start for start, _ in found if isinstance(start, LowPass)]
+    """Every form of a filter at its likeliest corners, the likeliest first."""
+    found = closest_starts(data, pieces(data, company), [LowPass.starts(data.ground, kind) for kind in FILTERS])
+    return [start for start in found if isinstance(start, LowPass)]
 
 
 def strengths(term: LowPass) -> Tensor:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.likelihoods.spectra.components import Term
+from gyrofuse.mismatch.likelihoods.spectra.fit import pieces
 from gyrofuse.mismatch.likelihoods.spectra.noise_parts import Ground
 from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios
 from gyrofuse.mismatch.likelihoods.spectra.starts import best_start
@@ -160,10 +161,10 @@ def _start(data: Ratios, company: Sequence[Term]) -> Term:
     centres = torch.linspace(math.log(lowest), math.log(0.46), 32, dtype=torch.float64)
     widths = torch.tensor([0.1, 0.3, 0.9], dtype=torch.float64).log()
     depths = torch.tensor([0.0, 0.1, 0.3, 0.7, 1.5, 3.0], dtype=torch.float64)
-    local = depths[:, None, None].expand(-1, 1, data.n_sensors)
+    local, beside = depths[:, None, None], pieces(data, company)
     every = torch.ones(1, data.n_sensors, dtype=torch.bool)
     starts = (
-        best_start(data, company, Notch(local, every, shared).within())
+        best_start(data, beside, Notch(local, every, shared).within())
         for shared in torch.cartesian_prod(centres, widths)
     )
     best, _ = max(starts, key=lambda start: start[1])

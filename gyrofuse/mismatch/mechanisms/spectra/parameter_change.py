@@ -14,7 +14,7 @@ from torch import Tensor
 from gyrofuse.mismatch.detectors.spectra.power_differs import power_differs
 from gyrofuse.mismatch.likelihoods.spectra.components import Shift, Term
 from gyrofuse.mismatch.likelihoods.spectra.data import block_spectra, reference_noise
-from gyrofuse.mismatch.likelihoods.spectra.fit import powers
+from gyrofuse.mismatch.likelihoods.spectra.fit import pieces, powers
 from gyrofuse.mismatch.likelihoods.spectra.noise_parts import Parts
 from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios
 from gyrofuse.mismatch.likelihoods.spectra.starts import best_start
@@ -57,7 +57,8 @@ class ParameterShift(Filter):
     def starts(cls, data: Ratios, company: Sequence[Term]) -> Iterable[Term]:
         if any(isinstance(term, Shift) for term in company) or not bool(data.ground.matters.any()):
             return
-        starts = [best_start(data, company, family)[0] for family in Shift.starts(data.ground)]
+        beside = pieces(data, company)
+        starts = [best_start(data, beside, family)[0] for family in Shift.starts(data.ground)]
         yield from starts
         # Two parts together, each from where it starts alone: from all at once one may stay where the other should be.
         for one, other in itertools.combinations(starts, 2):
@@ -135,7 +136,9 @@ class ParameterShift(Filter):
 
 def _start(data: Ratios) -> Term | None:
     """Other numbers of the simulation's parts, from the likeliest grid point; None where it has no part that shows."""
-    return best_start(data, [], Shift.starts(data.ground)[0])[0] if bool(data.ground.matters.any()) else None
+    return (
+        best_start(data, pieces(data, []), Shift.starts(data.ground)[0])[0] if bool(data.ground.matters.any()) else None
+    )
 
 
 def _said_of(lacking: Set[str], shape: Shape) -> str:
