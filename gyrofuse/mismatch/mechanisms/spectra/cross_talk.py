@@ -71,7 +71,7 @@ class CrossTalk(Spectral):
             sensors,
             parameters,
             alternatives=source_first.names,
-            gain=min(found.gain, source_first.most),
+            gain=min(max(found.gain, source_first.least), source_first.most),
         )
 
     @classmethod
@@ -120,10 +120,11 @@ class _SourceInstead(NamedTuple):
 
     Attributes:
         names: Of the source, where it does as well on blocks held out.
-        most: Nats that cross-talk may then count, so that the source is tried first.
+        least, most: Nats that cross-talk then counts, so that the likelier of both is tried first.
     """
 
     names: tuple[str, ...] = ()
+    least: float = -math.inf
     most: float = math.inf
 
 
@@ -139,7 +140,9 @@ def _source_instead(comparison: Comparison, mixing: CrossTalk) -> _SourceInstead
     more, chance = float((own - other).sum()), max(2 * sd_of_sum(own - other), NATS_AS_GOOD)
     if more < -chance:
         return None
-    return _SourceInstead() if more > chance else _SourceInstead((source.name,), best.gain - 1)
+    if more > chance:
+        return _SourceInstead(least=best.gain + 1)
+    return _SourceInstead((source.name,), most=best.gain - 1)
 
 
 def _held_out(effect: Spectral, comparison: Comparison) -> Tensor:
@@ -151,8 +154,25 @@ def _held_out(effect: Spectral, comparison: Comparison) -> Tensor:
 
 @derived
 def _whole_mixing(comparison: Comparison) -> Mixing:
-    """That of the whole recording."""
-    return _mixing(comparison, torch.ones(N_JUDGED, dtype=torch.bool))
+    """That of the whole recording.
+
+    Where spectra are alike, which of two has the other's signal shows in the powers: one has more than the simulation.
+    """
+    whole, most_pairs = torch.ones(N_JUDGED, dtype=torch.bool), 4
+    found = _mixing(comparison, whole)
+    pairs = (found.free & found.free.mT).triu().nonzero().tolist()
+    if not pairs or len(pairs) > most_pairs:
+        return found
+    score = float(_held_out(CrossTalk(found.matrix), comparison).sum())
+    for i, j in pairs:
+        both = found.free.clone()
+        for row, column in ((i, j), (j, i)):
+            free = both.clone()
+            free[row, column] = False
+            tried = _mixing(comparison, whole, free)
+            if (value := float(_held_out(CrossTalk(tried.matrix), comparison).sum())) > score:
+                found, score = tried, value
+    return found
 
 
 def _mixing(comparison: Comparison, blocks: Tensor, free: Tensor | None = None) -> Mixing:
