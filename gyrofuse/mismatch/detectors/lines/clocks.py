@@ -19,7 +19,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.decisions import NATS_AS_GOOD
+from gyrofuse.mismatch.decisions import CERTAIN, NATS_AS_GOOD
 from gyrofuse.mismatch.detectors.lines.lost_samples import Loss, losses_of, paths_of, put_back
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.signals.comparison import Comparison
@@ -107,15 +107,28 @@ def clock_test(comparison: Comparison) -> TestResult:
 
 @derived
 def strongest_slip(comparison: Comparison) -> Slip | None:
-    """The most likely slip of any tone that the recording shares with the simulation."""
+    """The most likely slip of any tone that the recording shares with the simulation, or that is new and steady."""
     block = comparison.n_samples // BLOCKS
-    lines = simulated_lines(comparison.reference)
+    lines, found = simulated_lines(comparison.reference), comparison.line
     tones = [f for f in lines if f * block >= 1 and not _rings(comparison, f)][:3]  # a cycle in a block, or more
+    if found.p_value < CERTAIN and found.frequency * block >= 1 and _steady(comparison, found.frequency):
+        tones.append(found.frequency)
     if not tones:
         return None
     slips = [slip for f in tones for slip in _of_tone(comparison, f, tuple(other for other in lines if other != f))]
     best = max(slips, key=lambda slip: slip.log_ratio, default=None)
     return None if best is None else replace(best, log_ratio=best.log_ratio - math.log(2 * len(tones)))
+
+
+def _steady(comparison: Comparison, f: float) -> bool:
+    """Whether a line is a tone of one phase in every sensor that has it, but for a slope: noise has as many as it likes.
+
+    A tenth of its power may be something else.
+    """
+    z = demodulated(comparison.white, f)
+    power = z.abs().square().sum(-1) - BLOCKS
+    has = power > NATS_AS_GOOD + power.max() / 100
+    return bool((_energy(z).amax(-1) > 0.9 * power)[has].all()) and int(has.sum()) > 1
 
 
 def _rings(comparison: Comparison, f: float) -> bool:
