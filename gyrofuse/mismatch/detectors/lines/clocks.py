@@ -110,7 +110,8 @@ def strongest_slip(comparison: Comparison) -> Slip | None:
     """The most likely slip of any tone that the recording shares with the simulation, or that is new and steady."""
     block = comparison.n_samples // BLOCKS
     lines, found = simulated_lines(comparison.reference), comparison.line
-    tones = [f for f in lines if f * block >= 1 and not _rings(comparison, f)][:3]  # a cycle in a block, or more
+    tones = [f for f in lines if f * block >= 1 and not _rings(comparison, f)]  # a cycle in a block, or more
+    tones = [f for f in tones if not _elsewhere(comparison, f)][:3]
     if found.p_value < CERTAIN and found.frequency * block >= 1 and _steady(comparison, found.frequency):
         tones.append(found.frequency)
     if not tones:
@@ -120,15 +121,26 @@ def strongest_slip(comparison: Comparison) -> Slip | None:
     return None if best is None else replace(best, log_ratio=best.log_ratio - math.log(2 * len(tones)))
 
 
+def _elsewhere(comparison: Comparison, f: float) -> bool:
+    """Whether what is near a line of the simulation has its phase in no sensor: it is a line of another frequency."""
+    power, energy = _power_and_energy(comparison, f)
+    return float(power.max()) > 2 * NATS_AS_GOOD and not bool((energy > power / 2)[power > power.max() / 100].any())
+
+
 def _steady(comparison: Comparison, f: float) -> bool:
     """Whether a line is a tone of one phase in every sensor that has it, but for a slope: noise has as many as it likes.
 
     A tenth of its power may be something else.
     """
-    z = demodulated(comparison.white, f)
-    power = z.abs().square().sum(-1) - BLOCKS
+    power, energy = _power_and_energy(comparison, f)
     has = power > NATS_AS_GOOD + power.max() / 100
-    return bool((_energy(z).amax(-1) > 0.9 * power)[has].all()) and int(has.sum()) > 1
+    return bool((energy > 0.9 * power)[has].all()) and int(has.sum()) > 1
+
+
+def _power_and_energy(comparison: Comparison, f: float) -> tuple[Tensor, Tensor]:
+    """What blocks have near a frequency above noise, and what a phase with the best slope has of it, `(sensor,)`."""
+    z = demodulated(comparison.white, f)
+    return z.abs().square().sum(-1) - BLOCKS, _energy(z).amax(-1)
 
 
 def _rings(comparison: Comparison, f: float) -> bool:

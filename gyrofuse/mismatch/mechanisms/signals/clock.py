@@ -124,6 +124,9 @@ class ClockSkew(Mechanism):
         for j, (at, count) in enumerate(losses):
             low = max(at - reach, losses[j - 1][0] + 1 if j else 1)
             high = min(at + reach, losses[j + 1][0] - 1 if j + 1 < len(losses) else comparison.n_samples - 1)
+            if low >= high:  # no sample is left between those next to it
+                limits.append((at, at))
+                continue
             t = torch.arange(low, high, dtype=torch.float64)
             ahead = float(sum(lost for _, lost in losses[:j]))
             turn = 2 * math.pi * self.frequency * (t + ahead)
