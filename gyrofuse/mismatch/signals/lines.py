@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import torch
 from scipy import fft, special
 from torch import Tensor
-from torch.nn.functional import max_pool1d
+from torch.nn.functional import avg_pool1d, max_pool1d
 
 from gyrofuse._base.transforms import fast_length
 from gyrofuse.mismatch.decisions import CERTAIN
@@ -149,7 +149,9 @@ def _lines(z: Tensor, length: int, side: Records, base: NoiseSpectrum, known: Te
     q = torch.cat([(part.conj() * (own @ part)).sum(0).real for own, part in zip(inverses, parts, strict=True)])
     q = q.masked_fill(known, 0.0)
     peak = q == max_pool1d(q[None, None], 2 * _FINER + 1, 1, _FINER)[0, 0]
-    at = (q * peak).topk(min(64, len(q))).indices
+    # Over what is around, the line itself included: in a stop band of the recording the edge is far above any line.
+    around = avg_pool1d(q[None, None], 2 * _NARROW * _FINER + 1, 1, _NARROW * _FINER, count_include_pad=False)[0, 0]
+    at = (q / around.clamp(min=1e-300) * peak).topk(min(64, len(q))).indices
     inverse = inverses[of_band[at]]
     matrices, m = _nearby(z, at, fine, inverse)
     here = z[:, at].mT  # (candidate, sensor)
