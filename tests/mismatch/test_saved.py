@@ -252,7 +252,7 @@ def test_refuses_numbers_that_are_none_of_a_mechanism(effect: Mechanism):
         (Step, {"onset_s": "nan"}, "effects.0.numbers.onset_s a finite number, got 'nan'"),
         (ClockSkew, {"sensors": [7]}, "effects.0 an effect that can be simulated, got IndexError"),
         (Resonance, {"mode": [1]}, r"effects.0.numbers.mode the numbers of a Mode by their names, got \[1\]"),
-        (VibrationTone, {"frequency_hz": -1e308}, "effects.0 an effect that makes finite samples"),
+        (VibrationTone, {"frequency_hz": -1e308}, "effects.0.numbers.frequency_hz a number below 1e154"),
         (RandomTelegraph, {"up": [1e-300, 1.0]}, "expected dwells of more than 0.01 samples"),
         (LowPassFilter, {"kind": "sieve"}, "effects.0 an effect that can be simulated, got KeyError: 'sieve'"),
     ],

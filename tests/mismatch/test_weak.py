@@ -15,7 +15,7 @@ from torch import Tensor
 import gyrofuse as gf
 from gyrofuse import WhiteNoise
 from gyrofuse.mismatch.detectors.values import quantisation_grid as lattices
-from gyrofuse.mismatch.detectors.values.ties import band_limits, fits_band, recurring
+from gyrofuse.mismatch.detectors.values.ties import band_of, recurring
 from gyrofuse.mismatch.detectors.values.values import values_test
 from gyrofuse.mismatch.detectors.variance import weak_outliers as shocks
 from gyrofuse.mismatch.detectors.variance.noise_level import compared_levels, level_between, whitened_recording
@@ -273,14 +273,17 @@ def test_values_of_single_precision_return_by_chance_alone() -> None:
 def test_limits_of_a_band_follow_from_the_nearest_value_left() -> None:
     away = torch.linspace(0.01, 1.0, 500, dtype=torch.float64)
     returns = torch.tensor([0.0, 0.5] * 5, dtype=torch.float64)
-    own = recurring(0, torch.cat([away, -1.2 * away, returns]), 0.0)
+    values = torch.cat([away, -1.2 * away, returns])
+    own = recurring(0, values, 0.0)
     assert own is not None
     assert (own.times, own.below, own.above) == (5, pytest.approx(-0.012), pytest.approx(0.01))
     q = stats.f.ppf([0.975, 0.5, 0.025], 2, 10)
     low, middle, high = 0.01 / (1 + q / 5)
-    assert band_limits(own) == pytest.approx((middle, low, high))
-    assert fits_band(own)
-    assert not fits_band(own._replace(times=40))
+    band = band_of(own, values, float(values.std()))
+    assert band is not None
+    assert (band.half_width, band.low, band.high) == pytest.approx((middle, low, high))
+    assert not band.subtracts
+    assert band_of(own._replace(times=40), values, float(values.std())) is None
 
 
 # Hidden lattices.

@@ -7,6 +7,7 @@ beside a tensor its shape. What fits its declaration may still be absurd, so eac
 from __future__ import annotations
 
 import math
+import sys
 import typing
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
@@ -150,6 +151,8 @@ def _number(value: Any, where: str, *, infinite: bool = False) -> float:
         return float(value)
     if isinstance(value, bool) or not isinstance(value, int | float) or not _finite(value):
         raise _wrong(where, "a number" if infinite else "a finite number", value)
+    if abs(value) > math.sqrt(sys.float_info.max):  # its square, a power, is not finite
+        raise _wrong(where, "a number below 1e154", value)
     return float(value)
 
 

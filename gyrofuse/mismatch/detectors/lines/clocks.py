@@ -128,7 +128,7 @@ def _elsewhere(comparison: Comparison, f: float) -> bool:
 
 
 def _steady(comparison: Comparison, f: float) -> bool:
-    """Whether a line is a tone of one phase in every sensor that has it, but for a slope: noise has as many as it likes.
+    """Whether a line is a tone of one phase in every sensor that has it, but for a slope: that of noise wanders.
 
     A tenth of its power may be something else.
     """

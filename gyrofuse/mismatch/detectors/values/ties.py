@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from scipy import stats
 from torch import Tensor
@@ -18,6 +19,7 @@ from gyrofuse.mismatch.detectors.values.quantisation_grid import distinct_values
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.records import Records
+from gyrofuse.mismatch.stats.limits import Z
 from gyrofuse.mismatch.stats.multiplicity import sidak
 
 _FEWEST = 4  # returns to a value that is not known from another sensor
@@ -132,7 +134,62 @@ def missing_recurrences(comparison: Comparison) -> dict[int, tuple[Recurring, fl
     return missing
 
 
-def band_limits(found: Recurring) -> tuple[float, float, float]:
+class Band(NamedTuple):
+    """A dead band around a value that recurs.
+
+    Attributes:
+        half_width: Half-width, and 95 % limits `low` and `high`, unit of the signal.
+        centre: Mean of the values without the band.
+        subtracts: Whether what lies beyond is put out less the half-width: the band leaves no gap then.
+    """
+
+    half_width: float
+    low: float
+    high: float
+    centre: float
+    subtracts: bool
+
+
+def band_of(found: Recurring, values: Tensor, sd: float) -> Band | None:
+    """The dead band that makes a value recur; None of a value that was filled in.
+
+    Args:
+        found: The value.
+        values: Samples, `(time,)`.
+        sd: Standard deviation of the simulation's values.
+    """
+    if _leaves_gap(found):
+        return Band(*_limits(found), float(values.mean()), False)
+    return _subtracted(found, values, sd)
+
+
+def _subtracted(found: Recurring, values: Tensor, sd: float) -> Band | None:
+    """A band that pulls what lies beyond it in: beside the value it is as dense as at the ends of the band.
+
+    The shares below and above the value tell band and mean of a normal law of the simulation's standard deviation. What
+    is pulled in scatters less than what is left where a value was filled in.
+    """
+    n, law, as_dense, nearer = len(values), stats.norm(), 1.25, 3.0
+    below, above = float((values < found.value).sum()) / n, float((values > found.value).sum()) / n
+    if min(below, above) < 10 / n or sd <= 0:
+        return None
+    z = law.ppf(below), law.isf(above)
+    at_ends = (law.pdf(z[0]) + law.pdf(z[1])) / 2 / sd * n
+    x = torch.from_numpy(law.ppf((np.arange(1000) + 0.5) / 1000))
+    pulled = float(((x - z[1]).clamp(min=0) + (x - z[0]).clamp(max=0)).std()) * sd
+    share = found.samples / n
+    filled = math.sqrt(1 - share) * math.hypot(sd, math.sqrt(share) * (found.value - found.middle))
+    spread = float(values.std())
+    off, otherwise = abs(math.log(spread / pulled)), abs(math.log(spread / filled))
+    if abs(math.log(found.density / at_ends)) > math.log(as_dense) or nearer * off + 4 / math.sqrt(n) > otherwise:
+        return None
+    half_width = sd * float(z[1] - z[0]) / 2
+    reach = Z * math.hypot(math.sqrt(share * (1 - share) / n) * sd / float(law.pdf(z).sum()), half_width / math.sqrt(n))
+    centre = found.value - sd * float(z[0] + z[1]) / 2
+    return Band(half_width, max(half_width - reach, 0.0), half_width + reach, centre, True)
+
+
+def _limits(found: Recurring) -> tuple[float, float, float]:
     """Half-width of a dead band, and 95 % limits.
 
     The nearest value that was left lies beyond it by an exponential variable: `reach/b - 1` is F distributed over the
@@ -144,7 +201,7 @@ def band_limits(found: Recurring) -> tuple[float, float, float]:
     return middle, low, high
 
 
-def fits_band(found: Recurring) -> bool:
+def _leaves_gap(found: Recurring) -> bool:
     """Whether as many samples are missing around the value as returned to it: it is not one that was filled in.
 
     The number missing follows from the density beside the band, as a normal law has it within; other laws are within a

@@ -81,8 +81,8 @@ class ClockSkew(Mechanism):
                 parameters[f"time_of_loss_{j + 1}"] = Parameter(at / rate, first / rate, last / rate, "s")
             times = ", ".join(f"{at / rate:.4g}" for at, _ in losses)
             sentence = (
-                f"{who} lost {lost} samples against {against}: its phase steps at {times} s; whole periods of the tone, "
-                f"{1 / slip.frequency:.4g} samples each, would leave no step"
+                f"{who} lost {lost} samples against {against}: its phase steps at {times} s; whole periods of "
+                f"the tone, {1 / slip.frequency:.4g} samples each, would leave no step"
             )
         else:
             reach = Z * slip.skew_sd
