@@ -260,7 +260,10 @@ def test_a_dead_band_that_pulls_in_what_is_beyond_it_is_no_repeats_and_no_quiete
             row = built[..., i, :].reshape(-1, N)[0]  # at the place of its own mean
             most = int(torch.unique(row, return_counts=True)[1].max())
             assert most / N == pytest.approx(share, abs=0.03), (seed, i)
-            assert float(built[..., i, :].std(-1).mean()) == pytest.approx(float(recording[i].std()), rel=0.03), (seed, i)
+            assert float(built[..., i, :].std(-1).mean()) == pytest.approx(float(recording[i].std()), rel=0.03), (
+                seed,
+                i,
+            )
         assert StuckSamples.detect_and_fit(comparison, LEVEL) is None
     assert inside >= 18
 

@@ -11,6 +11,7 @@ from collections.abc import Iterable
 
 from gyrofuse.mismatch.mechanisms.coherence_remainder import CoherenceRemainder
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
+from gyrofuse.mismatch.mechanisms.regimes.chirp import Chirp
 from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
 from gyrofuse.mismatch.mechanisms.regimes.ring_down import RingDown
 from gyrofuse.mismatch.mechanisms.regimes.scale_mixture import ScaleMixture
@@ -51,6 +52,7 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (Spikes, ScaleMixture),
     (ClockSkew,),
     (GSensitivity, QuadraticCoupling, ScaleFactor, ChannelTransfer),
+    (Chirp,),  # which passes any frequency
     (RingDown,),  # whose strongest are lines too
     (VibrationTone, ToneInSpells, ToneSize),
     (RandomTelegraph,),

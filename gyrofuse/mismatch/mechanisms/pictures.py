@@ -334,35 +334,47 @@ def likeliest_path(y: Tensor, variance: float, stay: float = 7 / 8) -> Tensor:
     return 2.0 * most_likely_path(log_likelihood, start, transition) - 1
 
 
-def spectrogram(ax: Axes, comparison: Comparison, sensor: int, frequency_hz: float, half_width_hz: float) -> None:
-    """Power of the recording over time and frequency around a line, and where it is highest at each time.
+def spectrogram(
+    ax: Axes,
+    comparison: Comparison,
+    sensor: int,
+    band_hz: tuple[float, float],
+    window_s: float,
+    track: tuple[Tensor, Tensor] | None,
+) -> None:
+    """Power of the recording over time and frequency in a band, and the track that was fitted.
 
     Args:
         ax: Axes to draw into.
         comparison: Recording and simulation.
         sensor: Position of the sensor.
-        frequency_hz, half_width_hz: Middle and half width of the line.
+        band_hz: Lowest and highest frequency.
+        window_s: Length of the pieces that are transformed.
+        track: Times, s, and frequencies, Hz, `(time,)`; None for none.
     """
+    seconds, f, power = power_over_time(comparison, sensor, window_s)
+    shown = (f >= band_hz[0] - 4 * f[1]) & (f <= band_hz[1] + 4 * f[1])
+    if int(shown.sum()) < 2:
+        return
+    level = power[:, shown].clamp(min=1e-300).log10().mT
+    low = float(level.median())
+    high = max(float(level.max()), low + 1.5)
+    image = level.numpy()
+    ax.pcolormesh(seconds.numpy(), f[shown].numpy(), image, cmap="Greys", vmin=low - 0.3, vmax=high, rasterized=True)
+    handles = [] if track is None else _plot(ax, *track, color=DASHED["color"], linewidth=0.8)
+    _finish(ax, handles, ["fitted"][: len(handles)], "time (s)", "frequency (Hz)")
+    ax.grid(visible=False)
+
+
+def power_over_time(comparison: Comparison, sensor: int, window_s: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Seconds `(piece,)`, frequencies in Hz `(bin,)` and powers `(piece, bin)` of the recording."""
     rate, n = comparison.info.rate, comparison.n_samples
-    window = int(min(max(2 * rate / max(half_width_hz, rate / n), 64), n / 8))
+    window = int(min(max(window_s * rate, 64), n / 8))
     hop = max(window // 4, n // 400)
     pieces = comparison.recording[sensor].unfold(-1, window, hop)
     power = torch.fft.rfft(pieces * torch.hann_window(window, dtype=pieces.dtype)).abs().square()
     f = torch.arange(power.shape[-1], dtype=torch.float64) / window * rate
-    reach = max(6 * half_width_hz, 4 * rate / window)
-    shown = (f - frequency_hz).abs() <= reach
-    if int(shown.sum()) < 2:
-        return
-    seconds = (torch.arange(len(power)) * hop + window / 2) / rate
-    level = power[:, shown].clamp(min=1e-300).log10().mT
-    low = float(level.median())
-    image = level.numpy()
-    high = max(float(level.max()), low + 1.5)
-    ax.pcolormesh(seconds.numpy(), f[shown].numpy(), image, cmap="Greys", vmin=low - 0.3, vmax=high, rasterized=True)
-    track = f[shown][power[:, shown].argmax(-1)]
-    handles = _plot(ax, seconds, track, color=DASHED["color"], linewidth=0.8)
-    _finish(ax, handles, ["highest power"], "time (s)", "frequency (Hz)")
-    ax.grid(visible=False)
+    return (torch.arange(len(power)) * hop + window / 2) / rate, f, power
 
 
 def _finish(ax: Axes, handles: list[Any], labels: list[str], x: str, y: str) -> None:

@@ -58,10 +58,10 @@ def _p_value(comparison: Comparison) -> float:
 @derived
 def _strongest(side: Records) -> Sweep:
     """The best track in the first record."""
-    return strongest_sweep(_decorrelated(side))
+    return strongest_sweep(decorrelated_record(side))
 
 
-def _decorrelated(side: Records) -> Tensor:
+def decorrelated_record(side: Records) -> Tensor:
     """Whitened record `(sensor, time)` without the coherence of broad bands."""
     white = left_out(side).white[0]
     n = white.shape[-1]

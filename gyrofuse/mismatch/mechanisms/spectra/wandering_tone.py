@@ -77,7 +77,10 @@ class DriftingTone(OscillationOnTop):
 
     def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
         rate = comparison.info.rate
-        pictures.spectrogram(ax, comparison, sensor, self.mode.centre * rate, self.mode.width * rate)
+        centre, width = self.mode.centre * rate, max(self.mode.width * rate, rate / comparison.n_samples)
+        band, window = (centre - 6 * width, centre + 6 * width), 2 / width
+        track = _loudest(comparison, sensor, band, window) if fitted else None
+        pictures.spectrogram(ax, comparison, sensor, band, window, track)
 
     def density(self, f: Tensor) -> Tensor:
         return self.mode.matrix() * self.mode.profile(f, 2 * float(f[1] - f[0]))[:, None, None]
@@ -201,3 +204,17 @@ def _share(comparison: Comparison, mode: Mode, normal: float) -> float:
 def _wandered(steps: Tensor, phi: float) -> Tensor:
     """AR1 path `(time,)` of its steps, the first one stationary."""
     return ar1_recursion(steps[None], torch.tensor([phi], dtype=steps.dtype))[0]
+
+
+def _loudest(
+    comparison: Comparison, sensor: int, band_hz: tuple[float, float], window_s: float
+) -> tuple[Tensor, Tensor]:
+    """Where the power in a band is highest at each time, medians of five; NaN where it is faint."""
+    seconds, f, power = pictures.power_over_time(comparison, sensor, window_s)
+    power = torch.where((f >= band_hz[0]) & (f <= band_hz[1]), power, 0.0)
+    best, at = power.max(-1)
+    track = (
+        torch.nn.functional.pad(f[at][None, None], (2, 2), mode="replicate")[0, 0].unfold(-1, 5, 1).median(-1).values
+    )
+    loud = 6.0  # times the median of the band, which exponential powers exceed in one of sixty-four
+    return seconds, torch.where(best > loud * power[power > 0].median(), track, math.nan)

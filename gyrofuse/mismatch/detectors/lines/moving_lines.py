@@ -1,0 +1,143 @@
+"""Test of a tone whose frequency moves: a motor that runs up, down, or from one speed to another.
+
+Whitened records are cut into segments. Powers `q` of segments and bins, over the medians of their bin and of their
+segment, are standard exponential by noise, and `1 + s` times as large on a tone, whose frequency moves by a few bins at
+most from one segment to the next, and which starts and stops.
+
+Statistic: mean likelihood ratio over all paths (forward algorithm of a hidden Markov model), tones' powers `s`, sets of
+sensors, and lengths of segments. Null law: that of an e-value (`p_value_from_e_value`).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gyrofuse._base.transforms import squared_modulus
+from gyrofuse.mismatch.detectors.lines.chirps import decorrelated_record
+from gyrofuse.mismatch.signals.comparison import Comparison
+from gyrofuse.mismatch.signals.derived import derived
+from gyrofuse.mismatch.signals.psd import light_taper
+from gyrofuse.mismatch.signals.records import Records
+from gyrofuse.mismatch.stats.multiplicity import p_value_beyond_reference, p_value_from_e_value
+
+_MOVES = 2  # bins from one segment to the next, at most
+_POWERS = (2.0, 8.0, 32.0)  # of a tone over the noise of a segment
+_LOWEST = 3  # bin: the taper's main lobe around zero
+
+
+class MovingLine(NamedTuple):
+    """The likeliest path of a tone.
+
+    Attributes:
+        log_ratio: Logarithm of the mean likelihood ratio over all paths, nats.
+        length: Samples of a segment.
+        path: Frequency in each segment, cycles per sample, `(segment,)`; NaN where there is no tone.
+    """
+
+    log_ratio: float
+    length: int
+    path: Tensor
+
+    @property
+    def p_value(self) -> float:
+        return p_value_from_e_value(self.log_ratio)
+
+
+def moving_line_p_value(comparison: Comparison) -> float:
+    """p value of the recording's, beyond what the simulation has itself."""
+    return p_value_beyond_reference(moving_line(comparison.observed).p_value, moving_line(comparison.reference).p_value)
+
+
+@derived
+def moving_line(side: Records) -> MovingLine:
+    """The likeliest of the first record."""
+    white = decorrelated_record(side)
+    n = white.shape[-1]
+    scales = []
+    for root in (1, 2, 4):
+        length = max(root * math.isqrt(n) // 2 * 2, 32)
+        if n // length < 32:
+            continue
+        power = _powers(white, length)
+        gains, ratios = _cell_ratios(power)
+        log_ratios = _forward(ratios)
+        scales.append((log_ratios, length, gains))
+    if not scales:
+        return MovingLine(-math.inf, n, torch.full((1,), math.nan, dtype=torch.float64))
+    values = torch.stack([log_ratios for log_ratios, _, _ in scales])
+    mean = float(values.flatten().logsumexp(0)) - math.log(values.numel())
+    best, which = divmod(int(values.argmax()), values[0].numel())
+    _, length, gains = scales[best]
+    path = _likeliest(gains.flatten(0, 1)[which])
+    return MovingLine(mean, length, torch.where(path >= 0, (path + _LOWEST) / length, math.nan))
+
+
+def _powers(white: Tensor, length: int) -> Tensor:
+    """Of segments and bins of whitened samples `(sensor, time)`, over medians of bins and segments, `(sensor, ...)`."""
+    count = white.shape[-1] // length
+    segments = white[:, : count * length].unflatten(-1, (count, length))
+    power = squared_modulus(torch.fft.rfft(segments * light_taper(length)))[..., _LOWEST:-1]
+    for dim in (-2, -1):
+        power = power / (power.median(dim, keepdim=True).values / math.log(2)).clamp(min=1e-300)
+    return power
+
+
+def _cell_ratios(power: Tensor) -> tuple[Tensor, Tensor]:
+    """Log likelihood ratios of tones in cells of powers `(sensor, segment, bin)`, `(set, power, segment, bin)`.
+
+    Of all sensors together, and of each alone. The same in units of probability, for sums.
+    """
+    p, count, bins = power.shape
+    m = 0.48 / (1 / count + 1 / bins)  # exponential variables whose mean is as well known as these medians
+    s = torch.tensor(_POWERS, dtype=power.dtype).view(-1, 1, 1)
+    # Of powers over an estimate, which are F distributed: they are as large by chance more often.
+    own = (m + 1) * (torch.log1p(power / m)[:, None] - torch.log1p(power[:, None] / (m * (1 + s)))) - s.log1p()
+    gains = torch.cat([own.sum(0, keepdim=True), own]) if p > 1 else own
+    return gains, gains.clamp(max=600.0).exp()
+
+
+def _forward(ratios: Tensor) -> Tensor:
+    """Logarithm of the mean over all paths, `(set * power,)`, of likelihood ratios `(set, power, segment, bin)`."""
+    cells = ratios.flatten(0, 1).movedim(1, 0)  # (segment, set, bin)
+    count, rows, bins = cells.shape
+    turn = 2 / count  # probability of a start or stop in a segment
+    on = torch.full((rows, bins), 0.5 / bins, dtype=cells.dtype)
+    off = torch.full((rows,), 0.5, dtype=cells.dtype)
+    log_sum = torch.zeros(rows, dtype=cells.dtype)
+    width = 2 * _MOVES + 1
+    for cell in cells:
+        moved = torch.nn.functional.avg_pool1d(on[:, None], width, 1, _MOVES)[:, 0]
+        begun = off * turn / bins
+        off = off * (1 - turn) + on.sum(-1) * turn
+        on = (moved * (1 - turn) + begun[:, None]) * cell
+        total = on.sum(-1) + off
+        on, off = on / total[:, None], off / total
+        log_sum += total.log()
+    return log_sum
+
+
+def _likeliest(gains: Tensor) -> Tensor:
+    """The likeliest path (Viterbi) through log likelihood ratios `(segment, bin)`: bins, -1 without a tone."""
+    count, bins = gains.shape
+    stay, turn, move = math.log1p(-2 / count), math.log(2 / count), -math.log(2 * _MOVES + 1)
+    width = 2 * _MOVES + 1
+    on, off = gains.new_full((bins,), math.log(0.5 / bins)), gains.new_tensor(math.log(0.5))
+    came, from_on = [], []
+    for cell in gains:
+        moved, index = torch.nn.functional.max_pool1d(on[None, None], width, 1, _MOVES, return_indices=True)
+        moved, begun = moved[0, 0] + stay + move, off + turn - math.log(bins)
+        came.append(torch.where(moved >= begun, index[0, 0], -1))
+        best, at = on.max(0)
+        from_on.append(int(at) if float(best + turn) > float(off + stay) else -1)
+        off = torch.maximum(off + stay, best + turn)
+        on = torch.maximum(moved, begun) + cell
+    state = int(on.argmax()) if float(on.max()) > float(off) else -1
+    path = []
+    for k in reversed(range(count)):
+        path.append(state)
+        state = int(came[k][state]) if state >= 0 else from_on[k]
+    return torch.tensor(path[::-1], dtype=torch.float64)

@@ -1,0 +1,236 @@
+"""A tone whose frequency moves: a motor that runs up or down, or from one speed to another."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated, ClassVar
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.decisions import NATS_PER_NUMBER
+from gyrofuse.mismatch.detectors.lines.moving_lines import MovingLine, moving_line, moving_line_p_value
+from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
+from gyrofuse.mismatch.mechanisms import pictures
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
+from gyrofuse.mismatch.mechanisms.regimes.transient import Transient, kept_of
+from gyrofuse.mismatch.signals.comparison import Comparison
+from gyrofuse.mismatch.signals.dims import Dims
+from gyrofuse.mismatch.signals.lines import whitened
+from gyrofuse.mismatch.stats.inclusion import included_sensors
+from gyrofuse.mismatch.stats.limits import Z
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_MOVES = 1.25  # highest over lowest frequency, from which a tone moves and does not wander
+_FEWEST = 8  # segments of a path
+
+
+@dataclass(frozen=True, eq=False)
+class Chirp(Transient):
+    """`x_i(t) = Re A_i(t) exp(i phi(t))` with `phi' = 2 pi f(t)`, `f` and `A` on straight lines between knots.
+
+    One source: the `A_i` have one course. Unlike that of a tone which wanders, the frequency goes somewhere, by a
+    quarter at least.
+
+    Attributes:
+        time_s: Knots, s after the first sample, `(knot,)`.
+        frequency_hz: `f` there, `(knot,)`.
+        cosine, sine: Real part of `A` there and its imaginary part times -1, unit of the signal, `(knot, sensor)`.
+    """
+
+    name: ClassVar[str] = "chirp"
+    separated_by: ClassVar[str] = "the speed of the motor, logged"
+    happened_once: ClassVar[bool] = True
+    time_words: ClassVar[str] = "is there from"
+    time_s: Annotated[Tensor, Dims(("knot",))]
+    frequency_hz: Annotated[Tensor, Dims(("knot",))]
+    cosine: Annotated[Tensor, Dims(("knot", "sensor"))]
+    sine: Annotated[Tensor, Dims(("knot", "sensor"))]
+
+    @classmethod
+    def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
+        p_value = moving_line_p_value(comparison)
+        course = None if p_value > level else _course(moving_line(comparison.observed))
+        if course is None:
+            return None
+        info, n = comparison.info, comparison.n_samples
+        everything = torch.ones(n, dtype=torch.bool)
+        effect = cls._of_course(comparison, *course)._fitted(comparison, everything)
+        for _ in range(4):
+            effect = effect._straightened(comparison, everything)
+        first, last = (float(effect.time_s[k]) for k in (0, -1))
+        samples = (last - first) * info.rate
+        sd = (2 * effect._noise(comparison) / samples).sqrt()  # of an amplitude throughout
+        there = included_sensors((effect._level() / sd).square(), 2).positions
+        outside = torch.ones(comparison.n_sensors, dtype=torch.bool)
+        outside[list(there)] = False
+        effect = replace(effect, cosine=effect.cosine * ~outside, sine=effect.sine * ~outside)
+        taken = whitened(effect.path(n, info.rate), comparison.base)
+        gain = float((comparison.white * taken - taken.square() / 2).sum())
+        gain -= NATS_PER_NUMBER * (2 * len(effect.time_s) + len(there))
+        if gain <= 0:
+            return None
+        step = float(effect.time_s[1] - effect.time_s[0])
+        start, stop = (float(effect.frequency_hz[k]) for k in (0, -1))
+        reach = 1 / (4 * step)  # a quarter of a bin of two steps
+        parameters = {
+            "start": Parameter(first, max(first - 2 * step, 0.0), first + 2 * step, "s"),
+            "stop": Parameter(last, last - 2 * step, min(last + 2 * step, n / info.rate), "s"),
+            "start_frequency": Parameter(start, max(start - reach, 0.0), start + reach, "Hz"),
+            "stop_frequency": Parameter(stop, max(stop - reach, 0.0), stop + reach, "Hz"),
+        }
+        size = effect._level()
+        for i in there:
+            a, own = float(size[i]), Z * float(sd[i])
+            parameters[f"amplitude[{i}]"] = Parameter(a, max(a - own, 0.0), a + own, info.measure)
+        loudest = max(there, key=lambda i: float(size[i]))
+        does = "runs up" if stop > start * _MOVES else "runs down" if start > stop * _MOVES else "changes its speed"
+        return Finding(
+            cls.name,
+            effect,
+            f"a tone whose frequency moves from {start:.4g} Hz at {first:.4g} s to {stop:.4g} Hz at {last:.4g} s in "
+            f"{info.named(there, 'all sensors')}, of amplitude {float(size[loudest]):.3g} {info.measure} (sensor "
+            f"{info.sensors[loudest]}), that the simulation does not have: something that {does}",
+            p_value,
+            there,
+            parameters,
+            levels=tuple(sorted({level_of(max(f / info.rate, 1 / n)) for f in (start, stop)})),
+            time_s=first,
+            gain=gain,
+        )
+
+    @classmethod
+    def _of_course(cls, comparison: Comparison, time: Tensor, frequency: Tensor) -> Chirp:
+        """Without amplitudes, of times in samples and frequencies in cycles per sample."""
+        rate = comparison.info.rate
+        none = torch.zeros(len(time), comparison.n_sensors, dtype=torch.float64)
+        return cls(time / rate, frequency * rate, none, none)
+
+    def _fitted(self, comparison: Comparison, keep: Tensor) -> Chirp:
+        """With the amplitudes of the samples to keep `(time,)`, of one source."""
+        first, inside, weights, turn = self._basis(comparison.n_samples, comparison.info.rate)
+        here = slice(first, first + len(turn))
+        signal = comparison.recording[:, here] - comparison.recording.mean(-1, keepdim=True)
+        kept = keep[here].to(torch.float64)
+        k = len(self.time_s)
+        gram = torch.zeros(k, k, dtype=torch.float64)
+        seen = torch.zeros(k, comparison.n_sensors, dtype=torch.complex128)
+        turned = 2 * (signal * kept * turn.conj()).mT  # (time, sensor)
+        for side, weight in enumerate(weights):
+            seen.index_add_(0, inside + side, weight[:, None] * turned)
+            for other, its in enumerate(weights):
+                gram.index_put_((inside + side, inside + other), weight * its * kept, accumulate=True)
+        gram += 1e-9 * gram.diagonal().max() * torch.eye(k, dtype=torch.float64)
+        amplitude = torch.linalg.solve(gram.to(seen.dtype), seen)  # (knot, sensor)
+        if comparison.n_sensors > 1:
+            scale = self._noise(comparison).sqrt()
+            u, s, v = torch.linalg.svd(amplitude / scale, full_matrices=False)
+            amplitude = s[0] * u[:, :1] * v[:1] * scale
+        return replace(self, cosine=amplitude.real, sine=-amplitude.imag)
+
+    def _straightened(self, comparison: Comparison, keep: Tensor) -> Chirp:
+        """With what the phases of neighbouring amplitudes say of the frequency between them."""
+        amplitude = torch.complex(self.cosine, -self.sine)
+        weight = 1 / self._noise(comparison)
+        both = ((amplitude[1:] * amplitude[:-1].conj()).to(torch.complex128) * weight).sum(-1)  # (knot - 1,)
+        near = torch.nn.functional.pad(both, (1, 1))
+        smooth = near[:-2] + 2 * both + near[2:]  # single ones of a faint tone are noise
+        off = smooth.angle() / (2 * math.pi * self.time_s.diff())
+        off = torch.cat([off[:1], (off[1:] + off[:-1]) / 2, off[-1:]])
+        moved = replace(self, frequency_hz=(self.frequency_hz + off).clamp(min=0.0, max=comparison.info.rate / 2))
+        return moved._fitted(comparison, keep)
+
+    def _noise(self, comparison: Comparison) -> Tensor:
+        """Density of the noise in the middle of the course, per sample `(sensor,)`."""
+        f = self.frequency_hz.median()[None] / comparison.info.rate
+        return comparison.base.spectrum(f)[:, 0]
+
+    def _level(self) -> Tensor:
+        """Root mean square of the amplitude, `(sensor,)`."""
+        return (self.cosine.square() + self.sine.square()).mean(0).sqrt()
+
+    def _basis(self, n_samples: int, rate: float) -> tuple[int, Tensor, tuple[Tensor, Tensor], Tensor]:
+        """First sample of the course, and for each of its samples the knot before it, weights of both, and the turn."""
+        first = max(math.ceil(float(self.time_s[0]) * rate - 1e-6), 0)
+        last = min(math.floor(float(self.time_s[-1]) * rate + 1e-6), n_samples - 1)
+        t = torch.arange(first, max(last + 1, first), dtype=torch.float64) / rate
+        step = self.time_s.diff()
+        inside = (torch.bucketize(t, self.time_s, right=True) - 1).clamp(0, len(step) - 1)
+        after = t - self.time_s[inside]
+        share = (after / step[inside].clamp(min=1e-12)).clamp(0.0, 1.0)
+        rise = self.frequency_hz.diff()
+        cycles = torch.nn.functional.pad(
+            ((self.frequency_hz[1:] + self.frequency_hz[:-1]) / 2 * step).cumsum(0), (1, 0)
+        )
+        angle = 2 * math.pi * (cycles[inside] + after * (self.frequency_hz[inside] + rise[inside] * share / 2))
+        return first, inside, (1 - share, share), torch.polar(torch.ones_like(angle), angle)
+
+    def _path(self, n_samples: int, rate: float, turned: float) -> Tensor:
+        first, inside, (before, after), turn = self._basis(n_samples, rate)
+        amplitude = torch.complex(self.cosine, -self.sine)
+        here = before[:, None] * amplitude[inside] + after[:, None] * amplitude[inside + 1]
+        path = torch.zeros(self.cosine.shape[-1], n_samples, dtype=torch.float64)
+        carrier = turn * complex(math.cos(turned), math.sin(turned))
+        path[:, first : first + len(turn)] = (here * carrier[:, None]).real.mT
+        return path
+
+    def path(self, n_samples: int, rate: float) -> Tensor:
+        return self._path(n_samples, rate, 0.0)
+
+    def drawn(self, n_samples: int, rate: float, generator: torch.Generator) -> Tensor:
+        """The same course at the same time, in another phase."""
+        turn = 2 * math.pi * float(torch.rand((), generator=generator, dtype=torch.float64))
+        return self._path(n_samples, rate, turn)
+
+    def fit_without(self, comparison: Comparison, fold: int) -> Chirp:
+        there = self.cosine.any(0) | self.sine.any(0)
+        found = self._fitted(comparison, kept_of(comparison.n_samples, fold))
+        return replace(found, cosine=found.cosine * there, sine=found.sine * there)
+
+    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+        low, high = float(self.frequency_hz.min()), float(self.frequency_hz.max())
+        track = (self.time_s, self.frequency_hz) if fitted else None
+        window = 2 * float(self.time_s[1] - self.time_s[0])
+        pictures.spectrogram(ax, comparison, sensor, (low - (high - low) / 4, high + (high - low) / 4), window, track)
+
+
+def _course(line: MovingLine) -> tuple[Tensor, Tensor] | None:
+    """Knots of the longest stretch in which a tone moves, samples, and their frequencies; None without one.
+
+    It moves by a quarter at least, and back and forth by twice as much as from end to end at most.
+    """
+    on = ~line.path.isnan()
+    edges = torch.nn.functional.pad(on.to(torch.int8), (1, 1)).diff().nonzero()[:, 0].tolist()
+    best: tuple[Tensor, Tensor] | None = None
+    for a, b in zip(edges[::2], edges[1::2], strict=True):
+        path = line.path[a:b]
+        reach = float(path.max() - path.min())
+        if b - a < _FEWEST or float(path.max()) < _MOVES * float(path.min()) or reach * line.length < _FEWEST:
+            continue
+        parts = torch.stack([part.mean() for part in path.tensor_split(min(12, b - a))])
+        if float(parts.diff().abs().sum()) > 2 * float(parts.max() - parts.min()):
+            continue
+        if best is not None and len(path) * line.length <= float(best[0][-1] - best[0][0]):
+            continue
+        half = line.length // 2
+        first, last = max(a - 1, 0), min(b + 1, len(line.path))  # in which it may begin, or end
+        time = torch.arange(first * line.length, last * line.length + 1, half, dtype=torch.float64)
+        middles = (torch.arange(a, b, dtype=torch.float64) + 0.5) * line.length
+        best = time, _interpolated(time, middles, _smooth(path))
+    return best
+
+
+def _smooth(path: Tensor) -> Tensor:
+    """Means of three neighbours: bins are whole."""
+    padded = torch.cat([2 * path[:1] - path[1:2], path, 2 * path[-1:] - path[-2:-1]])
+    return (padded[:-2] + padded[1:-1] + padded[2:]) / 3
+
+
+def _interpolated(at: Tensor, knots: Tensor, values: Tensor) -> Tensor:
+    """On straight lines between knots, and on beyond the ends."""
+    k = (torch.bucketize(at, knots) - 1).clamp(0, len(knots) - 2)
+    slope = (values[k + 1] - values[k]) / (knots[k + 1] - knots[k])
+    return (values[k] + slope * (at - knots[k])).clamp(0.0, 0.5)
