@@ -13,6 +13,7 @@ from torch import Tensor
 import gyrofuse as gf
 from gyrofuse.mismatch.likelihoods.spectra.filter_forms import filter_strength
 from gyrofuse.mismatch.mechanisms.coherence_remainder import CoherenceRemainder
+from gyrofuse.mismatch.mechanisms.regimes.chirp import Chirp
 from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
 from gyrofuse.mismatch.mechanisms.regimes.ring_down import RingDown
 from gyrofuse.mismatch.mechanisms.regimes.scale_mixture import ScaleMixture
@@ -208,6 +209,23 @@ def _(setting: Setting) -> Drawn:
     )
     truth = {"rate": 3600 * knocks / seconds, "frequency": frequency, "decay_time": decay}
     return Drawn(effect, truth | setting.of_each("amplitude", size))
+
+
+@draws(Chirp)
+def _(setting: Setting) -> Drawn:
+    start, stop, n_knots = setting.even(0.0, 0.2), setting.even(0.7, 1.0), 33
+    time = torch.linspace(start, stop, n_knots, dtype=torch.float64) * setting.n_samples / RATE
+    ends = [setting.even(0.06, 0.1) * RATE, setting.even(0.2, 0.4) * RATE]
+    if setting.chance():
+        ends.reverse()
+    size, phase = setting.sizes(0.35, 0.5) * setting.size, setting.even(0.0, 2 * math.pi)
+    effect = Chirp(
+        time,
+        torch.linspace(*ends, n_knots, dtype=torch.float64),
+        math.cos(phase) * size.expand(n_knots, -1),
+        math.sin(phase) * size.expand(n_knots, -1),
+    )
+    return Drawn(effect, {"start": float(time[0]), "stop": float(time[-1])} | setting.of_each("amplitude", size))
 
 
 @draws(ToneInSpells)

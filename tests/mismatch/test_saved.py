@@ -18,6 +18,7 @@ import gyrofuse as gf
 from gyrofuse.mismatch.mechanisms.catalogue import CATALOGUE
 from gyrofuse.mismatch.mechanisms.coherence_remainder import CoherenceRemainder
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
+from gyrofuse.mismatch.mechanisms.regimes.chirp import Chirp
 from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
 from gyrofuse.mismatch.mechanisms.regimes.ring_down import RingDown
 from gyrofuse.mismatch.mechanisms.regimes.scale_mixture import ScaleMixture
@@ -93,6 +94,12 @@ EVERY = (
         torch.tensor([[1 / 3, 0.0], [0.1, 0.2]], dtype=torch.float64),
         torch.tensor([[0.1, 0.0], [1 / 7, 0.2]], dtype=torch.float64),
         4.0,
+    ),
+    Chirp(
+        numbers(0.5, 20 / 3),
+        numbers(4.5, 9.0),
+        torch.tensor([[1 / 3, 0.0], [0.1, 0.2]], dtype=torch.float64),
+        torch.tensor([[0.1, 0.0], [1 / 7, 0.2]], dtype=torch.float64),
     ),
     ToneInSpells(
         numbers(0.5, 20 / 3),

@@ -33,6 +33,7 @@ _MECHANISMS: dict[str, Callable[[Bench, float], Part]] = {
     "vibration_tone": shapes.vibration_tone,
     "tone_in_spells": shapes.tone_in_spells,
     "ring_down": shapes.ring_down,
+    "chirp": strange.chirp,
     "drifting_tone": shapes.drifting_tone,
     "resonance": spectral.resonance,
     "quadratic_coupling": shapes.quadratic_coupling,
@@ -111,7 +112,6 @@ _COMBINED: dict[str, tuple[str, str]] = {
 }
 
 _OUTSIDE: dict[str, Callable[[Bench, float], Part]] = {
-    "chirp": strange.chirp,
     "laplace_noise": strange.laplace_noise,
     "cyclostationary_noise": _with(strange.modulated_noise, slow=False),
     "am_noise": _with(strange.modulated_noise, slow=True),

@@ -25,7 +25,6 @@ from gyrofuse.mismatch.signals.records import Records
 from gyrofuse.mismatch.stats.multiplicity import p_value_beyond_reference, p_value_from_e_value
 
 _MOVES = 2  # bins from one segment to the next, at most
-_POWERS = (2.0, 8.0, 32.0)  # of a tone over the noise of a segment
 _LOWEST = 3  # bin: the taper's main lobe around zero
 
 
@@ -93,7 +92,7 @@ def _cell_ratios(power: Tensor) -> tuple[Tensor, Tensor]:
     """
     p, count, bins = power.shape
     m = 0.48 / (1 / count + 1 / bins)  # exponential variables whose mean is as well known as these medians
-    s = torch.tensor(_POWERS, dtype=power.dtype).view(-1, 1, 1)
+    s = torch.tensor([2.0, 8.0, 32.0], dtype=power.dtype).view(-1, 1, 1)  # of a tone over the noise of a segment
     # Of powers over an estimate, which are F distributed: they are as large by chance more often.
     own = (m + 1) * (torch.log1p(power / m)[:, None] - torch.log1p(power[:, None] / (m * (1 + s)))) - s.log1p()
     gains = torch.cat([own.sum(0, keepdim=True), own]) if p > 1 else own

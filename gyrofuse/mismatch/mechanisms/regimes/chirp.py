@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _MOVES = 1.25  # highest over lowest frequency, from which a tone moves and does not wander
-_FEWEST = 8  # segments of a path
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,10 +63,11 @@ class Chirp(Transient):
         first, last = (float(effect.time_s[k]) for k in (0, -1))
         samples = (last - first) * info.rate
         sd = (2 * effect._noise(comparison) / samples).sqrt()  # of an amplitude throughout
-        there = included_sensors((effect._level() / sd).square(), 2).positions
+        size = effect._level() * effect._beyond_noise(comparison)
+        there = included_sensors((size / sd).square(), 2).positions
         outside = torch.ones(comparison.n_sensors, dtype=torch.bool)
         outside[list(there)] = False
-        effect = replace(effect, cosine=effect.cosine * ~outside, sine=effect.sine * ~outside)
+        effect = effect._shrunk(comparison, ~outside)
         taken = whitened(effect.path(n, info.rate), comparison.base)
         gain = float((comparison.white * taken - taken.square() / 2).sum())
         gain -= NATS_PER_NUMBER * (2 * len(effect.time_s) + len(there))
@@ -77,12 +77,11 @@ class Chirp(Transient):
         start, stop = (float(effect.frequency_hz[k]) for k in (0, -1))
         reach = 1 / (4 * step)  # a quarter of a bin of two steps
         parameters = {
-            "start": Parameter(first, max(first - 2 * step, 0.0), first + 2 * step, "s"),
-            "stop": Parameter(last, last - 2 * step, min(last + 2 * step, n / info.rate), "s"),
+            "start": Parameter(first, max(first - 4 * step, 0.0), first + 4 * step, "s"),
+            "stop": Parameter(last, last - 4 * step, min(last + 4 * step, n / info.rate), "s"),
             "start_frequency": Parameter(start, max(start - reach, 0.0), start + reach, "Hz"),
             "stop_frequency": Parameter(stop, max(stop - reach, 0.0), stop + reach, "Hz"),
         }
-        size = effect._level()
         for i in there:
             a, own = float(size[i]), Z * float(sd[i])
             parameters[f"amplitude[{i}]"] = Parameter(a, max(a - own, 0.0), a + own, info.measure)
@@ -111,6 +110,16 @@ class Chirp(Transient):
 
     def _fitted(self, comparison: Comparison, keep: Tensor) -> Chirp:
         """With the amplitudes of the samples to keep `(time,)`, of one source."""
+        gram, seen = self._normal_equations(comparison, keep)
+        amplitude = torch.linalg.solve(gram.to(seen.dtype), seen)  # (knot, sensor)
+        if comparison.n_sensors > 1:
+            scale = self._noise(comparison).sqrt()
+            u, s, v = torch.linalg.svd(amplitude / scale, full_matrices=False)
+            amplitude = s[0] * u[:, :1] * v[:1] * scale
+        return replace(self, cosine=amplitude.real, sine=-amplitude.imag)
+
+    def _normal_equations(self, comparison: Comparison, keep: Tensor) -> tuple[Tensor, Tensor]:
+        """Of the amplitudes at the knots, `(knot, knot)` and `(knot, sensor)`."""
         first, inside, weights, turn = self._basis(comparison.n_samples, comparison.info.rate)
         here = slice(first, first + len(turn))
         signal = comparison.recording[:, here] - comparison.recording.mean(-1, keepdim=True)
@@ -124,12 +133,19 @@ class Chirp(Transient):
             for other, its in enumerate(weights):
                 gram.index_put_((inside + side, inside + other), weight * its * kept, accumulate=True)
         gram += 1e-9 * gram.diagonal().max() * torch.eye(k, dtype=torch.float64)
-        amplitude = torch.linalg.solve(gram.to(seen.dtype), seen)  # (knot, sensor)
-        if comparison.n_sensors > 1:
-            scale = self._noise(comparison).sqrt()
-            u, s, v = torch.linalg.svd(amplitude / scale, full_matrices=False)
-            amplitude = s[0] * u[:, :1] * v[:1] * scale
-        return replace(self, cosine=amplitude.real, sine=-amplitude.imag)
+        return gram, seen
+
+    def _beyond_noise(self, comparison: Comparison) -> float:
+        """Factor of the amplitude that is not what noise makes of one course at so many knots."""
+        gram, _ = self._normal_equations(comparison, torch.ones(comparison.n_samples, dtype=torch.bool))
+        by_noise = 4 * float(torch.linalg.inv(gram).diagonal().mean())
+        seen = float((self._level().square() / self._noise(comparison)).sum())
+        return math.sqrt(max(1 - by_noise / max(seen, 1e-300), 0.0))
+
+    def _shrunk(self, comparison: Comparison, there: Tensor) -> Chirp:
+        """In some sensors `(sensor,)`, and by as much smaller as noise has a share of the power of its amplitudes."""
+        share = self._beyond_noise(comparison) ** 2 * there
+        return replace(self, cosine=self.cosine * share, sine=self.sine * share)
 
     def _straightened(self, comparison: Comparison, keep: Tensor) -> Chirp:
         """With what the phases of neighbouring amplitudes say of the frequency between them."""
@@ -187,8 +203,7 @@ class Chirp(Transient):
 
     def fit_without(self, comparison: Comparison, fold: int) -> Chirp:
         there = self.cosine.any(0) | self.sine.any(0)
-        found = self._fitted(comparison, kept_of(comparison.n_samples, fold))
-        return replace(found, cosine=found.cosine * there, sine=found.sine * there)
+        return self._fitted(comparison, kept_of(comparison.n_samples, fold))._shrunk(comparison, there)
 
     def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
         low, high = float(self.frequency_hz.min()), float(self.frequency_hz.max())
@@ -204,11 +219,12 @@ def _course(line: MovingLine) -> tuple[Tensor, Tensor] | None:
     """
     on = ~line.path.isnan()
     edges = torch.nn.functional.pad(on.to(torch.int8), (1, 1)).diff().nonzero()[:, 0].tolist()
+    fewest = 8  # segments of a path, and bins that it moves by
     best: tuple[Tensor, Tensor] | None = None
     for a, b in zip(edges[::2], edges[1::2], strict=True):
         path = line.path[a:b]
         reach = float(path.max() - path.min())
-        if b - a < _FEWEST or float(path.max()) < _MOVES * float(path.min()) or reach * line.length < _FEWEST:
+        if b - a < fewest or float(path.max()) < _MOVES * float(path.min()) or reach * line.length < fewest:
             continue
         parts = torch.stack([part.mean() for part in path.tensor_split(min(12, b - a))])
         if float(parts.diff().abs().sum()) > 2 * float(parts.max() - parts.min()):

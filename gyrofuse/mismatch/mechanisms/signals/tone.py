@@ -30,11 +30,6 @@ if TYPE_CHECKING:
 
 _TAIL = 0.025  # beyond either limit
 _STRONG, _FAR, _HALVINGS = 12.0, 6.0, 40  # standard deviations from which a law is normal, and beyond which none is
-_PER_PART = (
-    20.0  # squared amplitude over its variance in a part of a record: there a phase has a standard deviation of 0.2 rad
-)
-_FEWEST_PARTS, _MOST_PARTS = 4, 32  # of a record, from whose phases the wander of a tone is estimated
-_SIZES, _MOST_DECADES = 60, 4  # of walks that are tried, from a tenth of the noise's variance in the slowest mode on
 _REACH, _GUARD = 64, 3  # bins on either side that tell the noise, and those too near to
 
 
@@ -126,8 +121,11 @@ class VibrationTone(Mechanism):
             noise: Density of the noise near the tone, per sample `(sensor,)`.
             energy: Sum over sensors of the squared amplitudes in units of the variance that noise gives them.
         """
-        n = min(int(energy / _PER_PART), _MOST_PARTS)
-        if n < _FEWEST_PARTS:
+        fewest_parts, most_parts = 4, 32
+        per_part = 20.0  # squared amplitude over its variance: a phase has a standard deviation of 0.2 rad in a part
+        n_sizes, decades = 60, 4  # of walks, from a tenth of the noise's variance in the slowest mode on
+        n = min(int(energy / per_part), most_parts)
+        if n < fewest_parts:
             return 0.0
         length = comparison.n_samples // n
         angle = 2 * math.pi * self.frequency_hz * comparison.info.seconds(n * length)
@@ -144,10 +142,10 @@ class VibrationTone(Mechanism):
         values, vectors = torch.linalg.eigh(beside @ walk @ beside)
         values, left = values[2:], (vectors.mT @ phase)[2:]  # of a line itself there are two zeros
         own = n / energy  # variance of a phase by the noise
-        sizes = own / values[-1] * torch.logspace(-1, _MOST_DECADES, _SIZES, dtype=torch.float64)
+        sizes = own / values[-1] * torch.logspace(-1, decades, n_sizes, dtype=torch.float64)
         variance = torch.cat([torch.zeros(1, dtype=torch.float64), sizes])[:, None] * values + own
         log_likelihood = -(left.square() / variance + variance.log()).sum(-1) / 2
-        log_likelihood[0] += math.log(_SIZES)
+        log_likelihood[0] += math.log(n_sizes)
         expected = log_likelihood.softmax(0)[1:] @ sizes
         return math.sqrt(float(expected * (slope @ walk @ slope))) / (2 * math.pi * length)
 
