@@ -101,7 +101,15 @@ def _errors(signal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     white = _inverse_dct(y / spectrum.sqrt())
     inverse = _inverse(spectrum)
     error = _inverse_dct(y * inverse) / (inverse * (1 - followed)).mean()
-    return error, white, lines.any() | _nothing_slow(spectrum) | _ends_leak(error, white)
+    return error, white, lines.any() | _nothing_slow(spectrum) | _steep(spectrum) | _ends_leak(error, white)
+
+
+def _steep(spectrum: Tensor) -> Tensor:
+    """Whether a density `(k,)` falls by 20 dB below its median in a twentieth: there the ends ring, as loud as noise."""
+    fast = spectrum[len(spectrum) // 10 :]
+    return (
+        fast.quantile(0.05) < 0.01 * fast.median() if len(fast) < 2**24 else _steep(spectrum[:: 1 + len(fast) // 2**23])
+    )
 
 
 def _nothing_slow(spectrum: Tensor) -> Tensor:

@@ -188,9 +188,12 @@ def _alternatives(comparison: Comparison, found: Episodes) -> tuple[str, ...]:
 
 
 def _from_the_simulated_level(comparison: Comparison, found: Episodes) -> Episodes:
-    """Segments with both levels exchanged, where the simulation has the level that was taken for the changed one."""
+    """Segments with both levels exchanged, where the simulation has the level that was taken for the changed one.
+
+    In the sensors that change: another one may differ from the simulation throughout.
+    """
     inside = found.inside(comparison.n_samples)
-    squares, reference = comparison.white.square(), comparison.reference.signal
+    squares, reference = comparison.white[found.factor != 1].square(), comparison.reference.signal
     share = comparison.n_samples / (reference.shape[0] * reference.shape[-1])
 
     def off(part: Tensor) -> float:
