@@ -11,10 +11,12 @@ from gyrofuse import AR1, WhiteNoise
 from gyrofuse.mismatch.detectors.values import quantisation_grid as lattices
 from gyrofuse.mismatch.detectors.values import values as marginals
 from gyrofuse.mismatch.detectors.variance import outliers as impulses
+from gyrofuse.mismatch.detectors.variance.noise_level import variance_p_value
 from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.values.stuck_samples import StuckSamples
+from gyrofuse.mismatch.selection.held_out import score_held_out
 from gyrofuse.mismatch.signals import prediction_errors
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.stats.kurtosis import clipped_sd
@@ -219,6 +221,40 @@ def test_a_largest_value_that_recurs_on_a_fine_lattice_is_no_end_stop() -> None:
         first, second = row.topk(2).indices.tolist()
         row[second] = row[first]
     assert min(end.p_value for end in marginals.end_stops(Comparison.of(SCENE, recording, simulation))) > LEVEL
+
+
+@pytest.mark.parametrize(("step", "length"), [(0.0, 150), (0.0, 12), (0.3, 300)])
+def test_a_sensor_that_hangs_repeats_samples_and_is_no_quiet_noise(step: float, length: int) -> None:
+    """Three times, rounded or not: named with its rows, and filled in for all that is searched after it."""
+    recording, simulation, g = drawn(800 + length, records=2)
+    if step:
+        recording, simulation = (step * torch.round(x / step) for x in (recording, simulation))
+    for at in (1000, 2500, N - 800):
+        recording[1, at : at + length] = recording[1, at]
+    comparison = Comparison.of(SCENE, recording, simulation)
+    found = nominated(comparison, StuckSamples)
+    assert found.sensors == (1,)
+    assert isinstance(found.effect, StuckSamples)
+    assert found.effect.row[1] == pytest.approx(length - 1, rel=0.2)
+    assert score_held_out(comparison, found.effect).total > 0
+    left = found.effect.repair(comparison, g)
+    assert length < 100 or variance_p_value(comparison) < LEVEL / 100
+    assert variance_p_value(left) > 0.01
+    assert torch.equal(left.recording[0], recording[0])
+    built = found.effect.apply(torch.randn(2, 100_000, generator=g, dtype=torch.float64).repeat(2, 1)[:3], SCENE, g)
+    same = built[1, 1:] == built[1, :-1]
+    assert int((same[1:] & ~same[:-1]).sum()) == pytest.approx(int(same.sum()) / length, rel=0.35)
+
+
+def test_what_is_read_twice_repeats_every_second_sample() -> None:
+    recording, simulation, g = drawn(90, records=2)
+    recording[:, 1::2] = recording[:, 0::2]
+    found = nominated(Comparison.of(SCENE, recording, simulation), StuckSamples)
+    assert isinstance(found.effect, StuckSamples)
+    built = found.effect.apply(simulation, SCENE, g)
+    same = built[..., 1:] == built[..., :-1]
+    assert float((same[..., 1:] != same[..., :-1]).double().mean()) > 0.99
+    assert bool((same == same[..., :1, :]).all())
 
 
 @pytest.mark.parametrize("width", [0.002, 0.02, 0.2, 0.6, 1.0])

@@ -67,7 +67,7 @@ def features(signal: Tensor, window: int) -> Tensor:
             variance.log().flatten(1),
             shared,
             (change / scale).abs().amax(-1),
-            (change / scale).pow(4).mean(-1).log(),
+            (change / scale).pow(4).mean(-1).clamp(min=_TINY).log(),
             (change == 0).to(signal.dtype).mean(-1),
             moved,
         ],

@@ -76,13 +76,22 @@ def repeats(comparison: Comparison) -> Repeats:
     few, events, other_events = n * expected.maximum(by_resolution), _events(same), _events(other_same)
     portion = (n / (n + m / quieter)).numpy()  # of a simulation as long as would repeat as often with this noise
     compared = stats.binom.sf((events - 1).numpy(), (events + other_events).numpy(), portion)
-    counted = np.maximum(compared, stats.poisson.sf((events - 1).numpy(), few.numpy()))
+    by_resolution_alone = stats.poisson.sf((events - 1).numpy(), few.numpy())
+    # A sensor that hangs is no matter of how often values meet.
+    hangs = (_longest(same) >= 8) & (other_events == 0)
+    counted = np.where(hangs.numpy(), by_resolution_alone, np.maximum(compared, by_resolution_alone))
     return Repeats(share, expected, sd, torch.from_numpy(np.where(few.numpy() < 20.0, counted, many)), n)
 
 
 def _events(same: Tensor) -> Tensor:
     """How many runs of repeats `(sensor, record, time)` has, `(sensor,)`."""
     return (same[..., 1:] & ~same[..., :-1]).sum((1, 2))
+
+
+def _longest(same: Tensor) -> Tensor:
+    """Length of the longest run of repeats `(sensor, record, time)`, `(sensor,)`."""
+    place = torch.arange(1, same.shape[-1] + 1)
+    return (place - torch.where(same, 0, place).cummax(-1).values).amax((1, 2))
 
 
 @derived

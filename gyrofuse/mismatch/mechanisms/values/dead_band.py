@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, ClassVar
 
 import torch
@@ -52,7 +52,7 @@ class DeadBand(Mechanism):
     value: OfSensors
     half_width: OfSensors
     centre: OfSensors
-    subtracts: bool = False
+    subtracts: bool = field(default=False, metadata={"plain": True})
 
     @classmethod
     def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:

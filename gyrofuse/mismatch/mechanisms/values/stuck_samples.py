@@ -24,18 +24,22 @@ if TYPE_CHECKING:
 
 
 _TOGETHER = 0.5  # share of the repeats that all have at once, beyond chance
+_OFTEN = 1e-3  # probability of a repeat by chance, from which rows are not all the mechanism's
+_LONG = 4.0  # mean length of rows of repeats, from which a sensor hangs
 
 
 @dataclass(frozen=True, eq=False)
 class StuckSamples(Mechanism):
     """`y_t = y_{t-1}` with probability `p`, else `x_t`: more repeats than the values' own resolution makes.
 
-    On a lattice they are counted against those of the rounded simulation.
+    On a lattice they are counted against those of the rounded simulation. Repeats come in rows, of one where every
+    second sample is read twice, of many where a sensor hangs: a Markov chain with their mean length.
 
     Attributes:
         probability: `(sensor,)`.
         by_chance: `(sensor,)`, of a repeat without the mechanism.
         together: Whether all the sensors concerned repeat at the same time.
+        row: Mean number of repeats one after the other, `(sensor,)`; `1 / (1 - p)` where it is empty.
     """
 
     name: ClassVar[str] = "stuck_samples"
@@ -45,6 +49,7 @@ class StuckSamples(Mechanism):
     probability: OfSensors
     by_chance: OfSensors
     together: bool
+    row: tuple[float, ...] = ()
 
     @classmethod
     def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
@@ -66,13 +71,14 @@ class StuckSamples(Mechanism):
             spread = math.sqrt(own * (1 - own) * clustered / found.n)
             sd = math.hypot(float(found.sd[i]), spread) / (1 - float(effect.by_chance[i]))
             parameters[f"probability[{i}]"] = Parameter(value, max(value - Z * sd, 0.0), min(value + Z * sd, 1.0), "")
-        where = comparison.info.named(sensors, "all sensors")
+        where, longest = comparison.info.named(sensors, "all sensors"), max(effect.row)
+        hangs = f", {longest:.0f} times one after the other" if longest > _LONG else ""
         largest = max(sensors, key=lambda i: float(effect.probability[i]))
         jointly = " at the same time" if effect.together else ""
         return Finding(
             cls.name,
             effect,
-            f"samples repeat the one before{jointly} in {where}, with a probability of up to "
+            f"samples repeat the one before{hangs}{jointly} in {where}, with a probability of up to "
             f"{float(effect.probability[largest]):.3g} (sensor {comparison.info.sensors[largest]}), "
             f"where the simulation has {float(effect.by_chance[largest]):.2g}",
             min(p_values),
@@ -93,7 +99,11 @@ class StuckSamples(Mechanism):
         at = list(sensors)
         jointly = float(same[at].all(0).to(torch.float64).mean() - share[at].prod())
         together = len(at) > 1 and jointly > _TOGETHER * float(probability[at].min())
-        return cls(probability, chance, together)
+        length = [
+            _mean_row(row, float(c), float(p)) if p > 0 else 1.0
+            for row, c, p in zip(repeated(comparison.recording), chance, probability, strict=True)
+        ]
+        return cls(probability, chance, together, tuple(length))
 
     def fit_without(self, comparison: Comparison, fold: int) -> StuckSamples:
         keep = estimation_samples(comparison.n_samples, fold)
@@ -105,12 +115,41 @@ class StuckSamples(Mechanism):
         pictures.samples(ax, comparison, sensor, first, 60)
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
-        n = signal.shape[-1]
-        draws = (*signal.shape[:-2], 1, n) if self.together else signal.shape
-        held = torch.rand(draws, generator=generator, dtype=torch.float64) < self.probability[:, None]
+        n, records = signal.shape[-1], signal.reshape(-1, *signal.shape[-2:])
+        held = torch.zeros(records.shape, dtype=torch.bool)
+        enter, leave = self._turns()
+        largest = int(self.probability.argmax())
+        for record in held:
+            for i in self.probability.nonzero()[:, 0].tolist():
+                if not self.together or i == largest:
+                    record[i] = _rows(n, float(enter[i]), float(leave[i]), generator)
+            if self.together:
+                record[self.probability > 0] = record[largest].clone()
         held[..., 0] = False
         source = torch.where(held, 0, torch.arange(n)).cummax(-1).values
-        return signal.gather(-1, source)
+        return records.gather(-1, source).view(signal.shape)
+
+    def _turns(self) -> tuple[Tensor, Tensor]:
+        """Probabilities that a row of repeats begins with a sample, and that it ends before the next, `(sensor,)`."""
+        p = self.probability.clamp(max=1 - 1e-9)
+        length = torch.tensor(self.row, dtype=torch.float64) if self.row else 1 / (1 - p)
+        length = length.clamp(min=1.0).maximum(p / (1 - p))  # no more rows than samples between them
+        return (p / (1 - p) / length).clamp(max=1.0), 1 / length
+
+    def _hangs_beside_chance(self, sensor: int) -> bool:
+        """Whether rows of repeats have to be longer than those of chance to be told from them."""
+        return bool(self.row) and self.row[sensor] > _LONG and float(self.by_chance[sensor]) > _OFTEN
+
+    def repair(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
+        """Where a sensor hangs for long, noise as simulated takes the place of what it puts out."""
+        if max(self.row, default=0.0) <= _LONG:
+            return self.apply_to_reference(comparison, generator)
+        filled = comparison.recording.clone()
+        for i in self.probability.nonzero()[:, 0].tolist():
+            if self.row[i] > _LONG:
+                longest = _longest_by_chance(comparison.n_samples, float(self.by_chance[i]))
+                _fill(filled[i], comparison.reference.signal[0, i], longest)
+        return comparison.with_recording(filled)
 
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
         return held_out_blocks(self._scores(comparison), fold).sum((0, -1))
@@ -119,10 +158,16 @@ class StuckSamples(Mechanism):
         """Log likelihood ratio of each sample's being a repeat or not, `(sensor, time)`."""
         # A simulation without any repeats does not say that they are impossible.
         chance = self.by_chance.clamp(min=0.5 / comparison.reference.signal[:, 0].numel())
-        stuck = chance + self.probability * (1 - chance)
-        stuck = stuck.clamp(max=1 - 1e-9)
-        yes, no = (stuck / chance).log(), ((1 - stuck) / (1 - chance)).log()
-        scores = torch.where(repeated(comparison.recording), yes[:, None], no[:, None])
+        enter, leave = self._turns()
+        same = repeated(comparison.recording)
+        held = torch.zeros(same.shape, dtype=torch.float64)
+        for i in self.probability.nonzero()[:, 0].tolist():
+            seen = _longest_by_chance(len(same[i]), float(chance[i])) if self._hangs_beside_chance(i) else 1.0
+            before = torch.nn.functional.pad(_lengths_so_far(same[i])[:-1], (1, 0)) >= seen
+            held[i] = torch.where(before, 1 - leave[i], enter[i] if seen == 1 else 0.0)
+        chance = chance[:, None]
+        stuck = (chance + held * (1 - chance)).clamp(min=1e-9, max=1 - 1e-9)
+        scores = torch.where(same, (stuck / chance).log(), ((1 - stuck) / (1 - chance)).log())
         return torch.where(self.probability[:, None] > 0, scores, 0.0)
 
 
@@ -130,3 +175,66 @@ def run_lengths(true: Tensor) -> Tensor:
     """Lengths of the runs of true entries of `(time,)`, `(run,)`."""
     edges = torch.nn.functional.pad(true.to(torch.int8), (1, 1)).diff().nonzero()[:, 0]
     return edges.diff()[::2].to(torch.float64)
+
+
+def _rows(n: int, enter: float, leave: float, generator: torch.Generator) -> Tensor:
+    """Rows of repeats of a Markov chain with two states, `(time,)`."""
+    cycle = 1 / enter + 1 / leave
+    count = 16 + int(2 * n / cycle)
+    held = torch.zeros(n, dtype=torch.bool)
+    at = -int(float(torch.rand((), generator=generator, dtype=torch.float64)) * cycle)
+    while at < n:
+        gaps, lengths = (
+            1 + (u.log() / math.log1p(-min(p, 1 - 1e-12))).floor().clamp(max=n)
+            for u, p in zip(torch.rand(2, count, generator=generator, dtype=torch.float64), (enter, leave), strict=True)
+        )
+        ends = at + (gaps + lengths).cumsum(0)
+        change = torch.zeros(n + 1, dtype=torch.int64)
+        for place, sign in ((ends - lengths, 1), (ends, -1)):
+            change.index_add_(0, place.clamp(0, n).long(), torch.full((count,), sign))
+        held |= change[:-1].cumsum(0) > 0
+        at = int(ends[-1])
+    return held
+
+
+def _lengths_so_far(same: Tensor) -> Tensor:
+    """How many repeats one after the other each sample ends, `(time,)`."""
+    place = torch.arange(1, len(same) + 1)
+    return place - torch.where(same, 0, place).cummax(-1).values
+
+
+def _mean_row(same: Tensor, chance: float, probability: float) -> float:
+    """Mean length of the rows of repeats `(time,)`: of those beyond chance, where these are most of what is.
+
+    Where chance repeats samples as well, shorter rows are taken for those of independent repeats.
+    """
+    lengths = run_lengths(same)
+    long = lengths[lengths > _longest_by_chance(len(same), chance)]
+    if float(long.sum()) > (float(lengths.sum()) - chance * len(same)) / 2:
+        return float(long.mean()) if len(long) else 1.0
+    return float(lengths.mean()) if chance < _OFTEN and len(lengths) else 1 / (1 - min(probability, 0.999))
+
+
+def _longest_by_chance(n: int, chance: float) -> float:
+    """Length of a row of repeats that chance exceeds in one recording of a thousand."""
+    return max(_LONG, math.log(1e3 * n) / -math.log(max(chance, 1e-12)))
+
+
+def _fill(signal: Tensor, simulated: Tensor, longest: float) -> None:
+    """Put simulated noise, on a line from the mean before to that after, in the place of rows of repeats `(time,)`.
+
+    Args:
+        signal: Recording, `(time,)`, which is changed.
+        simulated: Simulation, `(time,)`.
+        longest: Length beyond which rows are replaced.
+    """
+    near = 16  # samples of a mean
+    same = torch.nn.functional.pad(repeated(signal).to(torch.int8), (1, 1)).diff().nonzero()[:, 0].tolist()
+    rows = [(a, b) for a, b in zip(same[::2], same[1::2], strict=True) if b - a > longest]
+    whole = signal.clone()
+    for a, b in rows:
+        before, after = whole[max(a - 1 - near, 0) : a - 1], whole[b : b + near]
+        ends = [float(part.mean()) if len(part) else float(whole.mean()) for part in (before, after)]
+        place = torch.arange(a, b) % len(simulated)
+        noise = simulated[place] - simulated[place].mean() if b - a > near else simulated[place] - simulated.mean()
+        signal[a:b] = noise + torch.linspace(ends[0], ends[1], b - a, dtype=signal.dtype)
