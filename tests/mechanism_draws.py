@@ -43,6 +43,7 @@ from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode
 from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
 from gyrofuse.mismatch.mechanisms.spectra.resonance import Resonance
 from gyrofuse.mismatch.mechanisms.spectra.wandering_tone import DriftingTone
+from gyrofuse.mismatch.mechanisms.values.angle_quantization import AngleQuantization
 from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
@@ -348,6 +349,13 @@ def _(setting: Setting) -> Drawn:
     mode = _mode(setting, 0.3, 0.4, shared=True)
     truth = {"frequency": mode.centre * RATE, **setting.of_each("amplitude", math.sqrt(2) * mode.gain.abs())}
     return Drawn(DriftingTone(mode, setting.chance()), truth)
+
+
+@draws(AngleQuantization)
+def _(setting: Setting) -> Drawn:
+    variance = setting.sizes(0.08, 0.15) * setting.size
+    angle = {name: math.sqrt(value) / RATE for name, value in setting.of_each("angle", variance).items()}
+    return Drawn(AngleQuantization(variance), angle)
 
 
 @draws(FlickerNoise)

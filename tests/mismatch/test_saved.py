@@ -48,6 +48,7 @@ from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode
 from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
 from gyrofuse.mismatch.mechanisms.spectra.resonance import Resonance
 from gyrofuse.mismatch.mechanisms.spectra.wandering_tone import DriftingTone
+from gyrofuse.mismatch.mechanisms.values.angle_quantization import AngleQuantization
 from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
@@ -128,6 +129,7 @@ EVERY = (
     Resonance(MODE),
     DriftingTone(MODE, True, 0.9),
     FlickerNoise(numbers(1 / 3, 0.0)),
+    AngleQuantization(numbers(1 / 3, 0.0)),
     CrossTalk(torch.tensor([[0.0, 1 / 3], [0.05, 0.0]], dtype=torch.float64)),
     CommonMode("ar1", 0.03, complex_numbers(0.1, 0.2j), BASE, True),
     DeadBand(numbers(0.0, 0.1), numbers(0.2, 0.0), numbers(0.01, 1 / 3)),

@@ -40,6 +40,7 @@ from gyrofuse.mismatch.mechanisms.spectra.notch import NotchFilter
 from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
 from gyrofuse.mismatch.mechanisms.spectra.resonance import Resonance
 from gyrofuse.mismatch.mechanisms.spectra.wandering_tone import DriftingTone
+from gyrofuse.mismatch.mechanisms.values.angle_quantization import AngleQuantization
 from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
@@ -59,7 +60,17 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (GradualChange,),  # where noise is louder, what is slow is known less well
     (TemperatureDrift, WarmUpTransient, Ramp, Step),
     (VarianceChange,),  # to which large jumps look alike
-    (ParameterShift, LowPassFilter, NotchFilter, Resonance, DriftingTone, FlickerNoise, CommonMode, CrossTalk),
+    (
+        ParameterShift,
+        LowPassFilter,
+        NotchFilter,
+        Resonance,
+        DriftingTone,
+        FlickerNoise,
+        AngleQuantization,
+        CommonMode,
+        CrossTalk,
+    ),
 )
 
 # What is left of slow courses and of spectra once nothing with a name is found any more.

@@ -138,6 +138,19 @@ def power_law(bench: Bench, nats: float, *, mechanism: str = "flicker", exponent
     )
 
 
+def quantization_noise(bench: Bench, nats: float) -> Part:
+    """Quantisation noise of an integrated angle: the first difference of white noise."""
+    sensors = bench.some_sensors(2)
+    gains = bench.gains(sensors, signed=False)
+    unit = 4 * np.sin(np.pi * grid(bench.n)) ** 2
+    part, size = added(bench, "quantization_noise", nats, gains[:, None] ** 2 * unit, broad=True)
+    signal = np.zeros((bench.n_sensors, bench.n))
+    for i in sensors:
+        signal[i] = math.sqrt(size) * gains[i] * np.diff(bench.rng.standard_normal(bench.n + 1))
+    angle = math.sqrt(size) * gains[list(sensors)] / bench.rate
+    return replace(part, signal=signal, parameters={"angle": quantity(rms(angle), "deg", angle)})
+
+
 def random_telegraph(
     bench: Bench, nats: float, *, dwell_share: float | None = None, asymmetries: tuple[float, float] = (0.6, 1.6)
 ) -> Part:
