@@ -135,9 +135,10 @@ class TwoLevels(NamedTuple):
 
     @property
     def resolved(self) -> bool:
-        """Whether dwells are longer than blocks, and 16 of them in the record."""
-        slow = len(self.means.y) / np.exp(self.theta[0, 1:]).mean() < 16.0
-        return not slow and not self.fast
+        """Whether dwells are longer than blocks, and 16 of them in the record, or 6 where these are plain."""
+        plain = 30.0  # nats
+        fewest = 6.0 if self.over > plain else 16.0
+        return bool(len(self.means.y) / np.exp(self.theta[0, 1:]).mean() >= fewest) and not self.fast
 
     @property
     def fast(self) -> bool:

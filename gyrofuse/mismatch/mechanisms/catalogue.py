@@ -47,6 +47,11 @@ from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.values.stuck_samples import StuckSamples
 from gyrofuse.mismatch.mechanisms.values.unit_scale import UnitScale
 
+
+def _stage_of(kind: type[Mechanism]) -> int:
+    return next(k for k, stage in enumerate(STAGES) if kind in stage)
+
+
 STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (UnitScale,),
     (Quantization, Clipping, StuckSamples),  # facts on the numbers themselves
@@ -72,6 +77,13 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
         CrossTalk,
     ),
 )
+
+# Stages that are searched once more after something was found in another: a course of the bias hides jumps between two
+# levels, and noise that the simulation lacks hides courses of the bias.
+AGAIN: dict[int, int] = {
+    _stage_of(TemperatureDrift): _stage_of(RandomTelegraph),
+    _stage_of(ParameterShift): _stage_of(TemperatureDrift),
+}
 
 # What is left of slow courses and of spectra once nothing with a name is found any more.
 UNNAMED: tuple[type[SlowRemainder] | type[Remainder] | type[CoherenceRemainder], ...] = (

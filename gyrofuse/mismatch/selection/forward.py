@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import torch
 
-from gyrofuse.mismatch.mechanisms.catalogue import STAGES
+from gyrofuse.mismatch.mechanisms.catalogue import AGAIN, STAGES
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, repaired
 from gyrofuse.mismatch.selection.discrepancy import leads_away
 from gyrofuse.mismatch.selection.held_out import HeldOutScore, score_held_out
@@ -53,12 +53,16 @@ def select(
         if len({i for one in selected for i in one.finding.hides}) == start.n_sensors:
             break
         progress(", ".join(kind.name for kind in stage), number / len(STAGES))
-        while len(selected) < _MOST:
-            best = _best_of_stage(stage, selected, start, comparison, level, generator)
-            if best is None:
+        before = len(selected)
+        for kinds in (stage, STAGES[AGAIN[number]]) if number in AGAIN else (stage,):
+            if kinds is not stage and len(selected) == before:
                 break
-            selected.append(best)
-            comparison = best.finding.repair(comparison, generator)
+            while len(selected) < _MOST:
+                best = _best_of_stage(kinds, selected, start, comparison, level, generator)
+                if best is None:
+                    break
+                selected.append(best)
+                comparison = best.finding.repair(comparison, generator)
     return selected, comparison
 
 
