@@ -150,7 +150,8 @@ def _pruned(
                 first = k
         if first == len(selected):
             return selected, comparison, without
-        selected, comparison = _repaired(selected[:first], kept[first:], selected[first].before, generator)
+        gone = [one.finding for one in selected if all(one.finding is not f for f in kept)]
+        selected, comparison = _repaired(selected[:first], kept[first:], selected[first].before, generator, gone)
 
 
 def _left_out(one: Selected, later: Sequence[Finding], generator: torch.Generator) -> tuple[HeldOutScore, Comparison]:
@@ -165,15 +166,31 @@ def _left_out(one: Selected, later: Sequence[Finding], generator: torch.Generato
 
 
 def _repaired(
-    selected: list[Selected], findings: Sequence[Finding], comparison: Comparison, generator: torch.Generator
+    selected: list[Selected],
+    findings: Sequence[Finding],
+    comparison: Comparison,
+    generator: torch.Generator,
+    gone: Sequence[Finding] = (),
 ) -> tuple[list[Selected], Comparison]:
-    """The findings so far, and others after them, each repaired in turn."""
+    """The findings so far, and others after them, each repaired in turn; fitted anew where one that had a part is gone."""
     selected = list(selected)
     for finding in findings:
+        if any(other.effect.additive and set(other.sensors) & set(finding.sensors) for other in gone):
+            finding = _found_again(finding, comparison)
         score = score_held_out(comparison, finding.effect)
         selected.append(Selected(replace(finding, held_out_gain=score.total), comparison, score))
         comparison = finding.repair(comparison, generator)
     return selected, comparison
+
+
+def _found_again(finding: Finding, comparison: Comparison) -> Finding:
+    """What is taken off a recording, with the numbers that it has there; as it was where it is not found again."""
+    again = type(finding.effect).detect_and_fit(comparison, 1.0) if finding.effect.additive else None
+    if again is None or again.mechanism != finding.mechanism or not set(again.sensors) & set(finding.sensors):
+        return finding
+    line = finding.frequency_hz is not None
+    alike = same_line(again, finding, comparison) if line else again.time_s == finding.time_s
+    return again if alike else finding
 
 
 def _with_rival(
