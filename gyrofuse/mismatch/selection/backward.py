@@ -172,7 +172,7 @@ def _repaired(
     generator: torch.Generator,
     gone: Sequence[Finding] = (),
 ) -> tuple[list[Selected], Comparison]:
-    """The findings so far, and others after them, each repaired in turn; fitted anew where one that had a part is gone."""
+    """The findings so far, and others after them, each repaired in turn; anew where one that had a part is gone."""
     selected = list(selected)
     for finding in findings:
         if any(other.effect.additive and set(other.sensors) & set(finding.sensors) for other in gone):
