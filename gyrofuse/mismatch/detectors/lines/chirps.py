@@ -48,6 +48,11 @@ def swept(comparison: Comparison, nats: float, level: float) -> bool:
     return _p_value(comparison) <= level and _strongest(comparison.observed).nats > nats
 
 
+def strongest_chirp(comparison: Comparison) -> tuple[float, Sweep]:
+    """The best straight track, and its p value beyond what the simulation shows."""
+    return _p_value(comparison), _strongest(comparison.observed)
+
+
 def _p_value(comparison: Comparison) -> float:
     p_value = _strongest(comparison.observed).p_value
     # Lines that both sides have leave traces of any size: beside what the simulation shows nothing can be said.

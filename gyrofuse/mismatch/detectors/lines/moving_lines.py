@@ -17,14 +17,14 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.transforms import squared_modulus
-from gyrofuse.mismatch.detectors.lines.chirps import decorrelated_record
+from gyrofuse.mismatch.detectors.lines.chirps import decorrelated_record, strongest_chirp
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.psd import light_taper
 from gyrofuse.mismatch.signals.records import Records
 from gyrofuse.mismatch.stats.multiplicity import p_value_beyond_reference, p_value_from_e_value
 
-_MOVES = 2  # bins from one segment to the next, at most
+_MOVES = 4  # bins from one segment to the next, at most
 _LOWEST = 3  # bin: the taper's main lobe around zero
 
 
@@ -49,6 +49,16 @@ class MovingLine(NamedTuple):
 def moving_line_p_value(comparison: Comparison) -> float:
     """p value of the recording's, beyond what the simulation has itself."""
     return p_value_beyond_reference(moving_line(comparison.observed).p_value, moving_line(comparison.reference).p_value)
+
+
+def straight_line(comparison: Comparison) -> tuple[float, MovingLine | None]:
+    """p value and path of the best straight track, which a faint tone shows on; None where it is folded back."""
+    p_value, track = strongest_chirp(comparison)
+    n = comparison.n_samples
+    length = n // 16 // 2 * 2  # few numbers: it is faint
+    middles = (torch.arange(n // length, dtype=torch.float64) + 0.5) * length / n
+    path = track.first + (track.last - track.first) * middles
+    return p_value, None if track.turns else MovingLine(track.nats, length, path)
 
 
 @derived

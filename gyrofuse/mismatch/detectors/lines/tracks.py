@@ -57,11 +57,13 @@ def strongest_sweep(white: Tensor) -> Sweep:
     kept = _conspicuous(white[:, : count * length].view(p, count, length).to(torch.float32), moves, signs)
     track = fitted_track(kept, signs, length, _CUT)
     searched = float((moves - 1) * count * length * len(signs))
-    first, last = (abs(math.remainder(end, 1.0)) for end in track.ends)
+    begun, seen = track.ends
+    ends = begun, begun + (seen - begun) * n / (count * length)  # segments do not fill the record
+    first, last = (abs(math.remainder(end, 1.0)) for end in ends)
     sensors = tuple(track.signs.nonzero()[:, 0].tolist())
     nats = count * (float(track.powers.median()) / math.log(2) - 1)
     near = 0.01  # halves of a cycle per sample next to which a frequency has not turned yet
-    low, high = (2 * end for end in sorted(track.ends))  # halves of a cycle per sample
+    low, high = (2 * end for end in sorted(ends))  # halves of a cycle per sample
     turns = tuple(0.5 if k % 2 else 0.0 for k in range(math.ceil(low + near), math.floor(high - near) + 1))
     return Sweep(sidak(math.exp(track.log_tail), searched), first, last, sensors, nats, turns)
 

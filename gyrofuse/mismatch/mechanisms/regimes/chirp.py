@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.decisions import NATS_PER_NUMBER
-from gyrofuse.mismatch.detectors.lines.moving_lines import MovingLine, moving_line, moving_line_p_value
+from gyrofuse.mismatch.detectors.lines.moving_lines import MovingLine, moving_line, moving_line_p_value, straight_line
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
@@ -20,6 +20,7 @@ from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.signals.lines import whitened
 from gyrofuse.mismatch.stats.inclusion import included_sensors
 from gyrofuse.mismatch.stats.limits import Z
+from gyrofuse.mismatch.stats.multiplicity import sidak
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -51,15 +52,14 @@ class Chirp(Transient):
 
     @classmethod
     def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
-        p_value = moving_line_p_value(comparison)
-        course = None if p_value > level else _course(moving_line(comparison.observed))
-        if course is None:
-            return None
+        lines = ((moving_line_p_value(comparison), moving_line(comparison.observed)), straight_line(comparison))
         info, n = comparison.info, comparison.n_samples
-        everything = torch.ones(n, dtype=torch.bool)
-        effect = cls._of_course(comparison, *course)._fitted(comparison, everything)
-        for _ in range(4):
-            effect = effect._straightened(comparison, everything)
+        p_value = sidak(min(p for p, _ in lines), 2)
+        courses = [_course(line, n) for p, line in lines if line is not None and sidak(p, 2) <= level]
+        tried = [cls._of_course(comparison, *course)._followed(comparison) for course in courses if course is not None]
+        if not tried:
+            return None
+        effect = max(tried, key=lambda one: one._gain(comparison) - one._cost())
         first, last = (float(effect.time_s[k]) for k in (0, -1))
         samples = (last - first) * info.rate
         sd = (2 * effect._noise(comparison) / samples).sqrt()  # of an amplitude throughout
@@ -68,9 +68,7 @@ class Chirp(Transient):
         outside = torch.ones(comparison.n_sensors, dtype=torch.bool)
         outside[list(there)] = False
         effect = effect._shrunk(comparison, ~outside)
-        taken = whitened(effect.path(n, info.rate), comparison.base)
-        gain = float((comparison.white * taken - taken.square() / 2).sum())
-        gain -= NATS_PER_NUMBER * (2 * len(effect.time_s) + len(there))
+        gain = effect._gain(comparison) - effect._cost()
         if gain <= 0:
             return None
         step = float(effect.time_s[1] - effect.time_s[0])
@@ -108,6 +106,25 @@ class Chirp(Transient):
         none = torch.zeros(len(time), comparison.n_sensors, dtype=torch.float64)
         return cls(time / rate, frequency * rate, none, none)
 
+    def _followed(self, comparison: Comparison) -> Chirp:
+        """Fitted to all samples, its frequency straightened as long as that explains more, its ends cut."""
+        everything = torch.ones(comparison.n_samples, dtype=torch.bool)
+        best = one = self._fitted(comparison, everything)
+        rounds = 5
+        for _ in range(rounds):
+            one = one._straightened(comparison, everything)
+            best = max(best, one, key=lambda fit: fit._gain(comparison))
+        return best._trimmed(comparison, everything)
+
+    def _gain(self, comparison: Comparison) -> float:
+        """Log likelihood ratio to none, nats."""
+        taken = whitened(self.path(comparison.n_samples, comparison.info.rate), comparison.base)
+        return float((comparison.white * taken - taken.square() / 2).sum())
+
+    def _cost(self) -> float:
+        """Nats that so many numbers gain by chance, and more."""
+        return NATS_PER_NUMBER * (2 * len(self.time_s) + int(self.cosine.any(0).sum()))
+
     def _fitted(self, comparison: Comparison, keep: Tensor) -> Chirp:
         """With the amplitudes of the samples to keep `(time,)`, of one source."""
         gram, seen = self._normal_equations(comparison, keep)
@@ -132,7 +149,7 @@ class Chirp(Transient):
             seen.index_add_(0, inside + side, weight[:, None] * turned)
             for other, its in enumerate(weights):
                 gram.index_put_((inside + side, inside + other), weight * its * kept, accumulate=True)
-        gram += 1e-9 * gram.diagonal().max() * torch.eye(k, dtype=torch.float64)
+        gram += 1e-2 * gram.diagonal().max() * torch.eye(k, dtype=torch.float64)  # a knot beyond the record has nothing
         return gram, seen
 
     def _beyond_noise(self, comparison: Comparison) -> float:
@@ -153,11 +170,25 @@ class Chirp(Transient):
         weight = 1 / self._noise(comparison)
         both = ((amplitude[1:] * amplitude[:-1].conj()).to(torch.complex128) * weight).sum(-1)  # (knot - 1,)
         near = torch.nn.functional.pad(both, (1, 1))
+        step, loud = float(self.time_s[1] - self.time_s[0]) * comparison.info.rate, 200.0  # squared phases of 1 / loud
         smooth = near[:-2] + 2 * both + near[2:]  # single ones of a faint tone are noise
-        off = smooth.angle() / (2 * math.pi * self.time_s.diff())
+        off = torch.where(both.abs() * step > loud, both, smooth).angle() / (2 * math.pi * self.time_s.diff())
         off = torch.cat([off[:1], (off[1:] + off[:-1]) / 2, off[-1:]])
         moved = replace(self, frequency_hz=(self.frequency_hz + off).clamp(min=0.0, max=comparison.info.rate / 2))
         return moved._fitted(comparison, keep)
+
+    def _trimmed(self, comparison: Comparison, keep: Tensor) -> Chirp:
+        """Without the knots of either end in which noise has as much power, but one."""
+        gram, _ = self._normal_equations(comparison, keep)
+        by_noise = 4 * torch.linalg.inv(gram).diagonal()
+        power = ((self.cosine.square() + self.sine.square()) / self._noise(comparison)).sum(-1)
+        beyond = torch.nn.functional.pad(power / by_noise, (1, 1))
+        there = ((beyond[:-2] + beyond[1:-1] + beyond[2:]) > 8).nonzero()[:, 0]  # of noise 3 on average
+        if len(there) < 2:
+            return self
+        kept = slice(max(int(there[0]) - 1, 0), int(there[-1]) + 2)
+        time, frequency, cosine, sine = (x[kept] for x in (self.time_s, self.frequency_hz, self.cosine, self.sine))
+        return Chirp(time, frequency, cosine, sine)._fitted(comparison, keep)
 
     def _noise(self, comparison: Comparison) -> Tensor:
         """Density of the noise in the middle of the course, per sample `(sensor,)`."""
@@ -212,7 +243,7 @@ class Chirp(Transient):
         pictures.spectrogram(ax, comparison, sensor, (low - (high - low) / 4, high + (high - low) / 4), window, track)
 
 
-def _course(line: MovingLine) -> tuple[Tensor, Tensor] | None:
+def _course(line: MovingLine, n_samples: int) -> tuple[Tensor, Tensor] | None:
     """Knots of the longest stretch in which a tone moves, samples, and their frequencies; None without one.
 
     It moves by a quarter at least, and back and forth by twice as much as from end to end at most.
@@ -232,21 +263,26 @@ def _course(line: MovingLine) -> tuple[Tensor, Tensor] | None:
         if best is not None and len(path) * line.length <= float(best[0][-1] - best[0][0]):
             continue
         half = line.length // 2
-        first, last = max(a - 1, 0), min(b + 1, len(line.path))  # in which it may begin, or end
-        time = torch.arange(first * line.length, last * line.length + 1, half, dtype=torch.float64)
+        # It may begin or end in segments beside, and what is left of the record is less than one.
+        beside = 3
+        first, last = max(a - beside, 0) * line.length, (b + beside) * line.length
+        last = min(last, n_samples + half) if last <= n_samples - line.length else n_samples + half
+        time = torch.arange(first, last + 1, half, dtype=torch.float64)
         middles = (torch.arange(a, b, dtype=torch.float64) + 0.5) * line.length
-        best = time, _interpolated(time, middles, _smooth(path))
+        best = time, _interpolated(time, middles, path)
     return best
 
 
-def _smooth(path: Tensor) -> Tensor:
-    """Means of three neighbours: bins are whole."""
-    padded = torch.cat([2 * path[:1] - path[1:2], path, 2 * path[-1:] - path[-2:-1]])
-    return (padded[:-2] + padded[1:-1] + padded[2:]) / 3
-
-
-def _interpolated(at: Tensor, knots: Tensor, values: Tensor) -> Tensor:
-    """On straight lines between knots, and on beyond the ends."""
+def _interpolated(at: Tensor, knots: Tensor, path: Tensor) -> Tensor:
+    """Means of three neighbours, since bins are whole, on straight lines between knots, and on as the ends go."""
+    several = 8  # knots of an end, whose line is gone on with
+    values = path.clone()
+    values[1:-1] = (path[:-2] + path[1:-1] + path[2:]) / 3
     k = (torch.bucketize(at, knots) - 1).clamp(0, len(knots) - 2)
     slope = (values[k + 1] - values[k]) / (knots[k + 1] - knots[k])
-    return (values[k] + slope * (at - knots[k])).clamp(0.0, 0.5)
+    found = values[k] + slope * (at - knots[k])
+    for part, beyond in ((slice(several), at < knots[1]), (slice(-several, None), at > knots[-2])):
+        x, y = knots[part] - knots[part].mean(), path[part]
+        line = y.mean() + (x @ y) / x.square().sum() * (at - knots[part].mean())
+        found = torch.where(beyond, line, found)
+    return found.clamp(0.0, 0.5)
