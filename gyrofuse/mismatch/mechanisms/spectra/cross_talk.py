@@ -163,15 +163,17 @@ def _whole_mixing(comparison: Comparison) -> Mixing:
     pairs = (found.free & found.free.mT).triu().nonzero().tolist()
     if not pairs or len(pairs) > most_pairs:
         return found
-    score = float(_held_out(CrossTalk(found.matrix), comparison).sum())
     for i, j in pairs:
-        both = found.free.clone()
+        ways = [found]
         for row, column in ((i, j), (j, i)):
-            free = both.clone()
+            free = found.free.clone()
             free[row, column] = False
-            tried = _mixing(comparison, whole, free)
-            if (value := float(_held_out(CrossTalk(tried.matrix), comparison).sum())) > score:
-                found, score = tried, value
+            ways.append(_mixing(comparison, whole, free))
+        scores = [_held_out(CrossTalk(way.matrix), comparison) for way in ways]
+        best = max(range(len(ways)), key=lambda k: float(scores[k].sum()))
+        leads = [scores[best] - other for k, other in enumerate(scores) if k != best]
+        if all(float(lead.sum()) > max(2 * sd_of_sum(lead), NATS_AS_GOOD) for lead in leads):
+            found = ways[best]
     return found
 
 
