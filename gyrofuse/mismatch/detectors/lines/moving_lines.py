@@ -45,6 +45,16 @@ class MovingLine(NamedTuple):
     def p_value(self) -> float:
         return p_value_from_e_value(self.log_ratio)
 
+    def passes(self, sample: int, frequency: float) -> bool:
+        """Whether it is there at a sample and a frequency, to three bins, and for many segments around."""
+        at, many, near = sample // self.length, 16, 3.0
+        there = ((self.path - frequency).abs() < near / self.length)[max(at - 1, 0) : at + 2]
+        on = ~self.path.isnan()
+        before, after = (~on[: at + 1]).nonzero()[:, 0], (~on[at:]).nonzero()[:, 0]
+        first = int(before[-1]) + 1 if len(before) else 0
+        last = at + int(after[0]) if len(after) else len(on)
+        return bool(there.any()) and last - first >= many
+
 
 def moving_line_p_value(comparison: Comparison) -> float:
     """p value of the recording's, beyond what the simulation has itself."""

@@ -12,6 +12,7 @@ from scipy import stats
 from torch import Tensor
 
 from gyrofuse.mismatch.decisions import NATS_AS_GOOD, NATS_PER_NUMBER
+from gyrofuse.mismatch.detectors.lines.moving_lines import moving_line
 from gyrofuse.mismatch.detectors.lines.ring_downs import ring_down_p_value, ring_downs, scanned_ring_downs
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.likelihoods.damped_tone import DampedTone, FittedTone, Surroundings
@@ -191,12 +192,15 @@ def _tones(comparison: Comparison) -> list[FittedTone]:
     left, scan, tones = comparison.recording, ring_downs(comparison), list[FittedTone]()
     # Scans, tones that are told apart, and cells of a scan that are no ring-down: what lasts has many of them.
     rounds, most, most_refused = 4, 48, 4
+    line = moving_line(comparison.observed)
     for _ in range(rounds):
         new, by_chance, refused = list[FittedTone](), math.log(scan.n_cells), 0
         least = by_chance + NATS_AS_GOOD
         for cell in scan.cells:
             if cell.log_ratio < by_chance or len(tones) + len(new) >= most or refused >= most_refused:
                 break
+            if line.passes(cell.onset, cell.frequency):  # which wanders, and beats with the noise
+                continue
             around = Surroundings.of(left, comparison.base, cell.onset, cell.tau)
             found = around.fitted(DampedTone(cell.onset, cell.frequency, cell.tau))
             which = list(included_sensors(2 * found.log_ratio, 2).positions)
