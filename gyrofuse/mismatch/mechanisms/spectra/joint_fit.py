@@ -294,7 +294,9 @@ def _with_sd(comparison: Comparison, chosen: Fit, i: int) -> tuple[Term, tuple[T
     """A shape and standard deviations of its numbers; of sharp peaks by narrower bands."""
     term = chosen.terms[i]
     if isinstance(term, Peak | CommonBump) and float(term.shared.diff()) < math.log(_SHARP):
-        return _closer(comparison, term, _others(chosen, i))
+        closer = _closer(comparison, term, _others(chosen, i))
+        if bool(closer[1][1].isfinite().all()):  # else there are too few bands next to zero
+            return closer
     return term, chosen.sd(i)
 
 
