@@ -83,12 +83,26 @@ def test_a_tone_of_another_size_is_told(factor: float):
 
 
 def test_a_tone_at_another_frequency_is_named_and_the_missing_one_told():
-    report = gf.diagnose(observed(toned(beta=0.3405), 4), toned())
+    report = gf.diagnose(observed(toned(beta=0.345), 4), toned())
     assert [finding.mechanism for finding in report.findings] == ["vibration_tone", "parameter_shift"]
-    assert report.findings[0].frequency_hz == pytest.approx(0.3405 / (2 * math.pi) * RATE, rel=1e-5)
+    assert report.findings[0].frequency_hz == pytest.approx(0.345 / (2 * math.pi) * RATE, rel=1e-5)
     assert "the simulation's tone at 5.4112" in report.findings[1].sentence
     assert "is not in the recording" in report.findings[1].sentence
     assert report.unexplained == ()
+
+
+@pytest.mark.parametrize("sampled", [False, True])
+def test_a_tone_that_is_nearly_where_it_was_shows_another_clock_or_frequency(sampled: bool):
+    """A phase that slips by less than a cycle: no other amplitude, and limits hold the factor of the frequencies."""
+    report = gf.diagnose(observed(toned(beta=0.3401), 4), observed(toned(), 100) if sampled else toned())
+    (finding,) = report.findings
+    assert finding.mechanism == "clock_skew"
+    assert finding.alternatives == ("vibration_tone",)
+    said = finding.parameters["skew"]
+    assert said.low < 1e6 * (0.3401 / 0.34 - 1) < said.high
+    assert said.high - said.low < 100
+    assert "the simulation's tone at 5.4112" in finding.sentence
+    assert not report.unexplained
 
 
 @pytest.mark.statistical

@@ -26,9 +26,10 @@ from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.known_lines import without_lines
 from gyrofuse.mismatch.signals.lines import sets_of, simulated_lines, whitened
-from gyrofuse.mismatch.stats.multiplicity import p_value_from_e_value
+from gyrofuse.mismatch.stats.multiplicity import e_value_of, p_value_from_e_value
 
 BLOCKS = 512  # in which a tone is demodulated: a loss is placed to one, then to the sample
+SIMULATION = "the simulation"  # as the reference of a clock
 _CYCLES, _FINER = 4, 32  # slopes of the phase that are searched, cycles over the record, and steps of one cycle
 
 
@@ -44,7 +45,7 @@ class Slip:
         lost: Limits of the samples lost in all.
         gain: Log likelihood over that of no slip, nats.
         log_ratio: Logarithm of the mean likelihood ratio over sets of sensors, tones, and slopes or steps.
-        reference: Name of the reference channel; None where the other sensors are the reference.
+        reference: Name of the reference channel, or `SIMULATION`; None where the other sensors are the reference.
     """
 
     frequency: float
@@ -101,7 +102,7 @@ def clock_test(comparison: Comparison) -> TestResult:
         sensors=slip.sensors,
         frequency_hz=f,
         time_s=slip.losses[0].at / comparison.info.rate if slip.losses else None,
-        channel=slip.reference,
+        channel=None if slip.reference == SIMULATION else slip.reference,
     )
 
 
@@ -117,8 +118,35 @@ def strongest_slip(comparison: Comparison) -> Slip | None:
     if not tones:
         return None
     slips = [slip for f in tones for slip in _of_tone(comparison, f, tuple(other for other in lines if other != f))]
+    slips += [slip for f in tones if f in lines and (slip := _from_simulated(comparison, f)) is not None]
     best = max(slips, key=lambda slip: slip.log_ratio, default=None)
     return None if best is None else replace(best, log_ratio=best.log_ratio - math.log(2 * len(tones)))
+
+
+def _from_simulated(comparison: Comparison, f: float) -> Slip | None:
+    """All sensors together against a tone of the simulation, which they have in one phase but for a slope."""
+    observed = demodulated(comparison.white, f)
+    simulated = demodulated(whitened(comparison.reference.signal[0], comparison.base), f)
+    power, energy = _power_and_energy(comparison, f)
+    (slope, size), (other, their_size) = best_slope(observed), best_slope(simulated)
+    if float(energy.sum()) < 0.9 * float(power.clamp(min=0).sum()) or min(size, their_size) < 2 * NATS_AS_GOOD:
+        return None
+    length = comparison.n_samples // BLOCKS * BLOCKS
+    same = comparison.reference.signal.shape[-1] / comparison.n_samples  # of another length: slopes are over the record
+    variance = _variance(size) + _variance(their_size) / same**2
+    z = (slope - other / same) / math.sqrt(variance)
+    scale = 1 / (f * length)
+    return Slip(
+        f,
+        tuple(range(comparison.n_sensors)),
+        (slope - other / same) * scale,
+        math.sqrt(variance) * scale,
+        (),
+        (0, 0),
+        z**2 / 2,
+        e_value_of(math.erfc(abs(z) / math.sqrt(2))),
+        SIMULATION,
+    )
 
 
 def _elsewhere(comparison: Comparison, f: float) -> bool:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.detectors.lines.clocks import BLOCKS, best_slope, demodulated, strongest_slip
+from gyrofuse.mismatch.detectors.lines.clocks import BLOCKS, SIMULATION, best_slope, demodulated, strongest_slip
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
@@ -92,6 +92,12 @@ class ClockSkew(Mechanism):
                 )
             }
             sentence = f"the clock of {who} differs by {_MILLION * slip.skew:.3g} ppm from {against}: its phase slips"
+            if slip.reference == SIMULATION:
+                sentence = (
+                    f"the simulation's tone at {slip.frequency * rate:.6g} Hz is at "
+                    f"{slip.frequency * (1 + slip.skew) * rate:.8g} Hz in {who}: their clock differs by "
+                    f"{_MILLION * slip.skew:.3g} ppm, or the frequency of the tone"
+                )
         return Finding(
             cls.name,
             effect,
@@ -102,7 +108,8 @@ class ClockSkew(Mechanism):
             levels=(level_of(slip.frequency),),
             frequency_hz=slip.frequency * rate,
             time_s=losses[0][0] / rate if losses else None,
-            channel=slip.reference,
+            channel=None if slip.reference == SIMULATION else slip.reference,
+            alternatives=("vibration_tone",) if slip.reference == SIMULATION else (),
             gain=slip.gain,
         )
 
