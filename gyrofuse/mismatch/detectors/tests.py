@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from gyrofuse._base.results import readable
-from gyrofuse.mismatch.detectors.lines.chirps import chirp_test
 from gyrofuse.mismatch.detectors.lines.clocks import clock_test
+from gyrofuse.mismatch.detectors.lines.moving_lines import moving_line_test
 from gyrofuse.mismatch.detectors.lines.ring_downs import ring_down_test
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.detectors.slow.channels import channel_test
@@ -28,7 +28,7 @@ TESTS: tuple[Callable[[Comparison], TestResult], ...] = (
     outliers_test,
     channel_test,
     line_test,
-    chirp_test,
+    moving_line_test,
     clock_test,
     ring_down_test,
     jump_test,

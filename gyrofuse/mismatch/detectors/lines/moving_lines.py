@@ -17,12 +17,14 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.transforms import squared_modulus
-from gyrofuse.mismatch.detectors.lines.chirps import decorrelated_record, strongest_chirp
+from gyrofuse.mismatch.detectors.lines.chirps import chirp_test, decorrelated_record, strongest_chirp
+from gyrofuse.mismatch.detectors.result import TestResult
+from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.psd import light_taper
 from gyrofuse.mismatch.signals.records import Records
-from gyrofuse.mismatch.stats.multiplicity import p_value_beyond_reference, p_value_from_e_value
+from gyrofuse.mismatch.stats.multiplicity import p_value_beyond_reference, p_value_from_e_value, sidak
 
 _MOVES = 4  # bins from one segment to the next, at most
 _LOWEST = 3  # bin: the taper's main lobe around zero
@@ -54,6 +56,23 @@ class MovingLine(NamedTuple):
         first = int(before[-1]) + 1 if len(before) else 0
         last = at + int(after[0]) if len(after) else len(on)
         return bool(there.any()) and last - first >= many
+
+
+def moving_line_test(comparison: Comparison) -> TestResult:
+    """A line whose frequency moves, straight on or on any path, that the simulation does not have."""
+    straight, p_value = chirp_test(comparison), moving_line_p_value(comparison)
+    both = sidak(min(straight.p_value, p_value), 2)
+    if p_value >= straight.p_value:
+        return straight._replace(p_value=both)
+    path, rate = moving_line(comparison.observed).path, comparison.info.rate
+    low, high = float(path.nan_to_num(nan=1.0).min()), float(path.nan_to_num(nan=0.0).max())
+    return TestResult(
+        "sweep",
+        both,
+        f"a line that moves between {low * rate:.4g} Hz and {high * rate:.4g} Hz in some of the sensors",
+        sensors=straight.sensors,
+        levels=tuple(sorted({level_of(max(f, 1 / comparison.n_samples)) for f in (low, high)})),
+    )
 
 
 def moving_line_p_value(comparison: Comparison) -> float:
