@@ -11,6 +11,7 @@ sensors, and lengths of segments. Null law: that of an e-value (`p_value_from_e_
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -63,7 +64,7 @@ def moving_line_test(comparison: Comparison) -> TestResult:
     straight, p_value = chirp_test(comparison), moving_line_p_value(comparison)
     both = sidak(min(straight.p_value, p_value), 2)
     if p_value >= straight.p_value:
-        return straight._replace(p_value=both)
+        return replace(straight, p_value=both)
     path, rate = moving_line(comparison.observed).path, comparison.info.rate
     low, high = float(path.nan_to_num(nan=1.0).min()), float(path.nan_to_num(nan=0.0).max())
     return TestResult(
