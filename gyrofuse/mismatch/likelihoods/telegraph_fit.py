@@ -70,7 +70,7 @@ class Means(NamedTuple):
         if tau < _FEWEST_BLOCKS * block:
             return None
         n = comparison.n_samples // N_JUDGED // block * N_JUDGED * block
-        y = comparison.recording[sensor, :n].unflatten(-1, (-1, block)).mean(-1).numpy()
+        y = _beside_channels(comparison, comparison.recording[sensor, :n].unflatten(-1, (-1, block)).mean(-1)).numpy()
         background = backgrounds(comparison.base, block)[sensor]
         return cls(y, background, _noise_alone(y, background), block)
 
@@ -93,6 +93,20 @@ class Means(NamedTuple):
         """Half step and dwells from their logarithms."""
         half, up, down = np.exp(theta).tolist()
         return Numbers(half, up * self.block, down * self.block)
+
+
+def _beside_channels(comparison: Comparison, means: Tensor) -> Tensor:
+    """Block means `(block,)` without a line on those of the channels: a course that follows one is no jump."""
+    most, n = 8, len(means)  # rows
+    rows = [v.to(torch.float64).reshape(-1, v.shape[-1]) for v in comparison.info.channels.values()]
+    block = comparison.n_samples // N_JUDGED * N_JUDGED // n
+    if not rows or sum(map(len, rows)) > most or min(v.shape[-1] for v in rows) < n * block:
+        return means
+    courses = torch.cat(rows)[:, : n * block].unflatten(-1, (n, block)).mean(-1)
+    courses = courses - courses.mean(-1, keepdim=True)
+    if not bool(courses.isfinite().all()):
+        return means
+    return means - courses.mT @ torch.linalg.lstsq(courses.mT, (means - means.mean())[:, None]).solution[:, 0]
 
 
 class TwoLevels(NamedTuple):

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -60,7 +61,7 @@ class Chirp(Transient):
         if not tried:
             return None
         effect = max(tried, key=lambda one: one._gain(comparison) - one._cost())
-        first, last = (float(effect.time_s[k]) for k in (0, -1))
+        first, last = max(float(effect.time_s[0]), 0.0), min(float(effect.time_s[-1]), n / info.rate)
         samples = (last - first) * info.rate
         sd = (2 * effect._noise(comparison) / samples).sqrt()  # of an amplitude throughout
         size = effect._level() * effect._beyond_noise(comparison)
@@ -72,7 +73,7 @@ class Chirp(Transient):
         if gain <= 0:
             return None
         step = float(effect.time_s[1] - effect.time_s[0])
-        start, stop = (float(effect.frequency_hz[k]) for k in (0, -1))
+        start, stop = np.interp([first, last], effect.time_s.numpy(), effect.frequency_hz.numpy()).tolist()
         reach = 1 / (4 * step)  # a quarter of a bin of two steps
         parameters = {
             "start": Parameter(first, max(first - 4 * step, 0.0), first + 4 * step, "s"),
