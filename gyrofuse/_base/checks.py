@@ -31,7 +31,7 @@ def check_signal(name: str, value: Tensor) -> Tensor:
 
     Raises:
         TypeError: Not a floating point tensor.
-        ValueError: Fewer than two dimensions, or no sensor.
+        ValueError: Fewer than two dimensions, no sensor, or thousands of sensors with fewer samples.
     """
     check_floating(name, value)
     if value.ndim < 2:
@@ -41,6 +41,12 @@ def check_signal(name: str, value: Tensor) -> Tensor:
         )
     if value.shape[-2] == 0:
         raise ValueError(f"`{name}`: expected at least one sensor, got shape {tuple(value.shape)}")
+    many = 1000  # sensors, whose covariances take gigabytes
+    if value.shape[-2] > max(many, value.shape[-1]):
+        raise ValueError(
+            f"`{name}`: expected (..., sensor, time), got shape {tuple(value.shape)}, more sensors than samples; "
+            "if time comes first, transpose with .mT"
+        )
     return value
 
 

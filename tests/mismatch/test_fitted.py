@@ -319,3 +319,14 @@ def test_a_model_file_and_the_command_line_say_what_a_model_was_fitted_to(run, t
     told_by_hand = run("diagnose", "log.npz", "--simulation", "old.json", "--fitted-samples", "5000")
     assert told_by_hand.status == 0
     assert "The model was fitted to 5000 samples" in told_by_hand.out
+
+
+def test_a_model_of_one_sensor_simulates_each_of_an_array():
+    """A fit of one row has its numbers for all, with their uncertainty."""
+    model = gf.WhiteNoise(1.0) + gf.RandomWalk(1e-6)
+    x = model.simulate(8192, batch=(3,), generator=torch.Generator().manual_seed(1))
+    fit = gf.fit_gmwm(gf.Recording(x[:1], rate=100.0, unit="deg/s"), "WN + RW")
+    for simulation in (fit, fit.model):
+        report = gf.diagnose(gf.Recording(x, rate=100.0, unit="deg/s"), simulation)
+        assert not report.mismatch
+        assert "8192 samples" in str(report)

@@ -184,16 +184,16 @@ def distance_from_grid(ax: Axes, comparison: Comparison, sensor: int, step: floa
     handles = []
     for signal, style in _as_one_mean(comparison, sensor):
         steps = (signal - offset) / step
-        density, edges = np.histogram((steps - steps.round()).numpy(), np.linspace(-0.5, 0.5, 101), density=True)
+        density, edges = np.histogram((steps - steps.round()).numpy(), np.linspace(-0.505, 0.505, 102), density=True)
         handles.append(ax.stairs(density, edges, **style))
     _finish(ax, handles, ["recording", "simulation"], "distance from the grid (steps)", "density")
 
 
 def _as_one_mean(comparison: Comparison, sensor: int) -> list[tuple[Tensor, dict[str, Any]]]:
     """Recording and first record of the simulation, `(time,)` each, with the mean of the recording, and their looks."""
-    own, other = comparison.recording[sensor], comparison.reference.signal[:, sensor]
-    shift = float(other.mean() - own.mean())
-    return [(own, _RECORDED), (other[0] - shift, _LINE)]
+    own, other = comparison.recording[sensor], comparison.reference.signal[0, sensor]
+    shift = float(other.mean() - own.mean())  # by which a grid of the simulation is shifted as well
+    return [(own, _RECORDED), (other - shift, _LINE)]
 
 
 def samples(ax: Axes, comparison: Comparison, sensor: int, first: int, count: int) -> None:

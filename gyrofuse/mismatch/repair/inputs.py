@@ -201,6 +201,8 @@ def _drawn(model: Model | ArrayModel, n_sensors: int, n_samples: int, generator:
     if isinstance(model, ArrayModel):
         return model.simulate(n_samples, batch=(n_records,), generator=generator)
     own = model.params.shape[:-1]
+    if own == (1,):  # one sensor's, for all
+        model, own = model.with_params(model.params[0]), torch.Size()
     if own not in ((), (n_sensors,)):
         raise ValueError(
             f"`simulation`: expected a model of one sensor, or with parameters ({n_sensors},) for each, "

@@ -109,6 +109,8 @@ def as_array(model: Model, n_sensors: int) -> ArrayModel:
     The same numbers for all sensors are one estimate, whose errors they share.
     """
     params, estimate = model.params, model.estimated_from
+    if params.ndim == 2 and len(params) == 1 < n_sensors:  # one sensor's, for all
+        params, estimate = params[0], own_record(estimate, 0)
     if params.ndim == 2:
         own = [own_record(estimate, i) for i in range(n_sensors)]
         return ArrayModel.from_sensors(
