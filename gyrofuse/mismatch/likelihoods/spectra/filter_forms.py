@@ -1,11 +1,12 @@
 """Low-pass filters by their form and one number: digital ones, analogue ones as sampling leaves them, averages.
 
-A form is an analogue prototype `H(u)` that halves the power at `u = 1`, of a warped frequency `u = g(f) / g(f_c)`:
-`g = tan(pi f)` of the bilinear transform, or `g = 2 f` of an analogue filter in front of the converter. A Gaussian
-window cuts a FIR filter's ideal step off smoothly; pass bands with ripples have half a decibel of them. Beside those
-stand one and two poles `(1 - q) / (1 - q / z)`, the mean over `a` samples, the last of which counts in part, and what
-sampling leaves of analogue means over `a` samples, `sum_k sinc(a (f + k))^2m` over its value at 0: one mean, as of a
-converter that integrates, or two in a row, which weigh in a triangle.
+A form is an analogue prototype `H(u)` that halves the power at `u = 1`, of a warped frequency `u = g(f) / g(f_c)`: `g =
+tan(pi f)` of the bilinear transform, or `g = 2 f` of an analogue filter in front of the converter, whose noise beyond
+half the rate is folded back: `sum_k |H(g(f + k) / g(f_c))|^2` over its value at 0. A Gaussian window cuts a FIR
+filter's ideal step off smoothly; pass bands with ripples have half a decibel of them. Beside those stand one and two
+poles `(1 - q) / (1 - q / z)`, the mean over `a` samples, the last of which counts in part, and what sampling leaves of
+analogue means over `a` samples, `sum_k sinc(a (f + k))^2m` over its value at 0: one mean, as of a converter that
+integrates, or two in a row, which weigh in a triangle.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ class _Form(NamedTuple):
 
     Attributes:
         warp: "tan" or "straight".
-        prototype: "butterworth", "bessel", "chebyshev" or "window".
+        prototype: "butterworth", "bessel", "chebyshev", "window", or "folded": Butterworth's with its aliases.
         order: Of all but the last.
         width: Of a window's step, standard deviation over its middle.
         power: Of `g(f_c)^-2` that `strength` is.
@@ -45,6 +46,8 @@ _FORMS = {
     **{f"bilinear{n}": _Form("tan", "butterworth", n) for n in (3, 4)},
     **{f"bessel{n}": _Form("tan", "bessel", n) for n in (2, 3, 4)},
     "chebyshev4": _Form("tan", "chebyshev", 4),
+    "analogue2": _Form("straight", "folded", 2, power=2),
+    "analogue4": _Form("straight", "folded", 4, power=2),
     # Widths a factor of 1.6 apart: Hamming windows of 11 to 61 taps at a cutoff of a fifth of the rate.
     **{f"window{k}": _Form("straight", "window", width=0.08 * 1.6**k) for k in range(4)},
 }
@@ -58,7 +61,7 @@ _LONGEST = 0.9999  # pole: of a time constant of 10^4 samples
 
 
 def filter_strength(kind: str, corner: Tensor) -> Tensor:
-    """Number of a filter whose power is halved at `corner` cycles per sample: 0 is none."""
+    """Number of a filter whose power is halved at `corner` cycles per sample, before aliases come: 0 is none."""
     if kind in _POLES:
         return strength_of(kind, torch.sin(math.pi * corner).log())
     if kind in _MEANS:  # a longer mean passes less, until its first zero
@@ -80,7 +83,7 @@ def filter_strength(kind: str, corner: Tensor) -> Tensor:
 
 
 def filter_corner(kind: str, strength: Tensor) -> Tensor:
-    """Cycles per sample at which a filter halves the power; infinite where it never does."""
+    """Cycles per sample at which a filter halves the power, before aliases come; infinite where it never does."""
     if kind in _FORMS and _FORMS[kind].prototype != "window":
         form = _FORMS[kind]
         g = strength.clamp(min=1e-300).pow(-1 / (2 * form.power))
@@ -132,7 +135,16 @@ def filter_power(kind: str, strength: Tensor, f: Tensor) -> Tensor:
         return folded(a, f) / folded(a, torch.zeros_like(f[..., :1]))
     if kind in _FORMS and _FORMS[kind].prototype == "butterworth":
         return 1 / (1 + _prototype_frequency(kind, strength, f).pow(2 * _FORMS[kind].order))
+    if kind in _FORMS and _FORMS[kind].prototype == "folded":
+        return _folded(kind, strength, f) / _folded(kind, strength, torch.zeros_like(f[..., :1]))
     return filter_response(kind, strength, f).abs().square()
+
+
+def _folded(kind: str, strength: Tensor, f: Tensor) -> Tensor:
+    """Power of an analogue filter with what is folded back from three rates to either side."""
+    images = range(-3, 4)
+    powers = [1 / (1 + _prototype_frequency(kind, strength, (f + k).abs()).pow(2 * _FORMS[kind].order)) for k in images]
+    return sum(powers, torch.zeros_like(powers[0]))
 
 
 def _one_mean(a: Tensor, f: Tensor) -> Tensor:
@@ -170,7 +182,7 @@ def filter_response(kind: str, strength: Tensor, f: Tensor) -> Tensor:
         turn = 2 * math.pi * f
         response = (1 - q) / (1 - q * torch.polar(torch.ones_like(turn), -turn))
         return response if kind == "pole" else response.square()
-    if kind in _SAMPLED_MEANS:
+    if kind in _SAMPLED_MEANS or (kind in _FORMS and _FORMS[kind].prototype == "folded"):
         ends = filter_power(kind, strength, f).sqrt()
         return torch.complex(ends, torch.zeros_like(ends))
     if kind == "average":

@@ -164,7 +164,9 @@ def leading_shape(comparison: Comparison) -> Shape | None:
     fits &= not mended
     if not fits and explained < _LARGELY:
         return None
+    wider = torch.ones(data.n_sensors, dtype=torch.float64) if fits else _overdispersion(data, chosen)
     seen = [_with_sd(comparison, chosen, i) for i in range(len(chosen.terms))]
+    seen = [(term, (local * wider, shared * wider.max())) for term, (local, shared) in seen]
     first, gain, alone = _first(data, chosen, [term for term, _ in seen])
     term, others = chosen.terms[first], _others(chosen, first)
     n_classes = 16.0  # classes and frequencies that compete
@@ -204,6 +206,12 @@ def _explained(data: Ratios, chosen: Fit) -> tuple[bool, float]:
     # Where sensors share what they had before, powers have nothing to explain.
     explained = 1 - after / max(before, 1e-9) if nothing.p_value <= CERTAIN else 1.0
     return left.p_value > CERTAIN, explained
+
+
+def _overdispersion(data: Ratios, chosen: Fit) -> Tensor:
+    """Factors of standard deviations `(sensor,)` where a form is not quite the recording's: quasi-likelihood's."""
+    dof = data.weight.sum(0).clamp(min=1.0)
+    return (1 + 2 * fitness(data, chosen.model).excess.clamp(min=0) / dof).sqrt()
 
 
 def _first(data: Ratios, chosen: Fit, terms: list[Term]) -> tuple[int, float, bool]:
