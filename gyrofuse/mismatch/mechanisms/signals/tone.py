@@ -28,11 +28,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-_TAIL = 0.025  # beyond either limit
-_STRONG, _FAR, _HALVINGS = 12.0, 6.0, 40  # standard deviations from which a law is normal, and beyond which none is
-_REACH, _GUARD = 64, 3  # bins on either side that tell the noise, and those too near to
-
-
 @dataclass(frozen=True, eq=False)
 class VibrationTone(Mechanism):
     """`x_i(t) = cosine_i cos(2 pi f t) + sine_i sin(2 pi f t)` in every sensor `i`.
@@ -206,7 +201,8 @@ class VibrationTone(Mechanism):
 def density_near(comparison: Comparison, f: float) -> Tensor:
     """Noise of the recording around a line, without the line itself, per sample `(sensor,)`."""
     power, length = _tapered_power(comparison.observed)
-    apart = torch.cat([torch.arange(-_REACH, -_GUARD), torch.arange(_GUARD + 1, _REACH + 1)])
+    reach, guard = 64, 3  # bins on either side that tell the noise, and those too near to
+    apart = torch.cat([torch.arange(-reach, -guard), torch.arange(guard + 1, reach + 1)])
     places = f + apart / comparison.n_samples
     places = places[(places > 2.5 / comparison.n_samples) & (places < 0.5 - 0.5 / comparison.n_samples)]
     here = comparison.base.spectrum(torch.tensor([f], dtype=torch.float64))
@@ -238,7 +234,8 @@ def amplitude_limits(snr: Tensor, seen: float) -> Tensor:
     """
     value = (snr.square() - 1).clamp(min=0.0).sqrt()
     limits = value + Z * torch.tensor([[-1.0], [1.0]], dtype=torch.float64)
-    weak = snr < _STRONG
+    strong = 12.0  # standard deviations, from which the law is normal
+    weak = snr < strong
     if bool(weak.any()):
         low, high = _tail_limits(snr[weak], seen if float(snr.min()) > seen else 0.0)
         limits[:, weak] = torch.stack([low, high.maximum(value[weak])])
@@ -247,9 +244,10 @@ def amplitude_limits(snr: Tensor, seen: float) -> Tensor:
 
 def _tail_limits(snr: Tensor, seen: float) -> Tensor:
     """Amplitudes at which what comes beyond `seen` is beyond `snr` with 2.5 and 97.5 %, `(2, sensor)`, halved in on."""
-    wanted = torch.tensor([[_TAIL], [1 - _TAIL]], dtype=torch.float64)
-    low, high = torch.zeros(2, len(snr), dtype=torch.float64), (snr + _FAR).repeat(2, 1)
-    for _ in range(_HALVINGS):
+    tail, far, halvings = 0.025, 6.0, 40  # beyond either limit; standard deviations beyond which no amplitude is
+    wanted = torch.tensor([[tail], [1 - tail]], dtype=torch.float64)
+    low, high = torch.zeros(2, len(snr), dtype=torch.float64), (snr + far).repeat(2, 1)
+    for _ in range(halvings):
         middle = (low + high) / 2
         law = stats.ncx2(2, middle.square().numpy())
         share = torch.from_numpy(law.sf(snr.square().numpy()) / law.sf(seen**2))
