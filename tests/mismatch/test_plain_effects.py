@@ -15,7 +15,7 @@ from torch import Tensor
 
 import gyrofuse as gf
 from gyrofuse.mismatch.detectors.lines.moving_lines import MovingLine, moving_line
-from gyrofuse.mismatch.signals.comparison import Comparison
+from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 
 N, RATE = 16_384, 200.0
 T = np.arange(N) / RATE
@@ -120,9 +120,16 @@ def test_it_is_named_and_nothing_else_is(case: Case) -> None:
 @pytest.mark.statistical
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 def test_it_is_named_nearly_always(case: Case) -> None:
-    """Right names, and no other, in 10 of 12 at least: of 95 % one study in fifty has fewer."""
-    named = [sorted(f.mechanism for f in diagnosed(case.recording(seed)).findings) for seed in range(2, 14)]
-    assert sum(names == sorted(case.names) for names in named) >= 10, named
+    """Right names, or listed as what the data do not tell apart, and no other, in 10 of 12 at least.
+
+    Of 95 % one study in fifty has fewer.
+    """
+    right = 0
+    for seed in range(2, 14):
+        findings = diagnosed(case.recording(seed)).findings
+        told = [name for name in case.names if any(name in (f.mechanism, *f.alternatives) for f in findings)]
+        right += len(told) == len(case.names) == len(findings)
+    assert right >= 10
 
 
 def test_jumps_are_seen_beside_a_course_of_temperature() -> None:
@@ -148,7 +155,7 @@ def test_paths_of_noise_have_a_mean_likelihood_ratio_below_one() -> None:
     for seed in range(200):
         recording, simulation, _ = drawn(9000 + seed)
         rows = 1 + seed % 3
-        info = SCENE if rows == 3 else gf.mismatch.RecordingInfo(100.0, "deg/s", ("x", "y", "z")[:rows], {})
+        info = SCENE if rows == 3 else RecordingInfo(100.0, "deg/s", ("x", "y", "z")[:rows], {})
         found.append(moving_line(Comparison.of(info, recording[:rows], simulation[:, :rows]).observed))
     ratios = torch.tensor([line.log_ratio for line in found]).exp()
     assert float(ratios.clamp(max=1e3).mean()) < 2
