@@ -127,7 +127,7 @@ def _from_simulated(comparison: Comparison, f: float) -> Slip | None:
     """All sensors together against a tone of the simulation, which they have in one phase but for a slope."""
     observed = demodulated(comparison.white, f)
     simulated = demodulated(whitened(comparison.reference.signal[0], comparison.base), f)
-    power, energy = _power_and_energy(comparison, f)
+    power, energy = _power_and_energy(observed)
     (slope, size), (other, their_size) = best_slope(observed), best_slope(simulated)
     if float(energy.sum()) < 0.9 * float(power.clamp(min=0).sum()) or min(size, their_size) < 2 * NATS_AS_GOOD:
         return None
@@ -151,7 +151,7 @@ def _from_simulated(comparison: Comparison, f: float) -> Slip | None:
 
 def _elsewhere(comparison: Comparison, f: float) -> bool:
     """Whether what is near a line of the simulation has its phase in no sensor: it is a line of another frequency."""
-    power, energy = _power_and_energy(comparison, f)
+    power, energy = _power_and_energy(demodulated(comparison.white, f))
     return float(power.max()) > 2 * NATS_AS_GOOD and not bool((energy > power / 2)[power > power.max() / 100].any())
 
 
@@ -160,14 +160,13 @@ def _steady(comparison: Comparison, f: float) -> bool:
 
     A tenth of its power may be something else.
     """
-    power, energy = _power_and_energy(comparison, f)
+    power, energy = _power_and_energy(demodulated(comparison.white, f))
     has = power > NATS_AS_GOOD + power.max() / 100
     return bool((energy > 0.9 * power)[has].all()) and int(has.sum()) > 1
 
 
-def _power_and_energy(comparison: Comparison, f: float) -> tuple[Tensor, Tensor]:
-    """What blocks have near a frequency above noise, and what a phase with the best slope has of it, `(sensor,)`."""
-    z = demodulated(comparison.white, f)
+def _power_and_energy(z: Tensor) -> tuple[Tensor, Tensor]:
+    """Power of rows `(row, block)` above noise, and what a phase with the best slope has of it, `(row,)`."""
     return z.abs().square().sum(-1) - BLOCKS, _energy(z).amax(-1)
 
 

@@ -78,7 +78,7 @@ def repeats(comparison: Comparison) -> Repeats:
     compared = stats.binom.sf((events - 1).numpy(), (events + other_events).numpy(), portion)
     by_resolution_alone = stats.poisson.sf((events - 1).numpy(), few.numpy())
     # A sensor that hangs is no matter of how often values meet.
-    hangs = (_longest(same) >= 8) & (other_events == 0)
+    hangs = (repeats_so_far(same).amax((1, 2)) >= 8) & (other_events == 0)
     counted = np.where(hangs.numpy(), by_resolution_alone, np.maximum(compared, by_resolution_alone))
     return Repeats(share, expected, sd, torch.from_numpy(np.where(few.numpy() < 20.0, counted, many)), n)
 
@@ -88,10 +88,10 @@ def _events(same: Tensor) -> Tensor:
     return (same[..., 1:] & ~same[..., :-1]).sum((1, 2))
 
 
-def _longest(same: Tensor) -> Tensor:
-    """Length of the longest run of repeats `(sensor, record, time)`, `(sensor,)`."""
+def repeats_so_far(same: Tensor) -> Tensor:
+    """How many repeats one after the other each sample ends, `(..., time)`."""
     place = torch.arange(1, same.shape[-1] + 1)
-    return (place - torch.where(same, 0, place).cummax(-1).values).amax((1, 2))
+    return place - torch.where(same, 0, place).cummax(-1).values
 
 
 @derived

@@ -109,13 +109,10 @@ class Chirp(Transient):
 
     def _followed(self, comparison: Comparison) -> Chirp:
         """Fitted to all samples, its frequency straightened as long as that explains more, its ends cut."""
-        everything = torch.ones(comparison.n_samples, dtype=torch.bool)
-        best = one = self._fitted(comparison, everything)
-        rounds = 5
+        tried, rounds = [self._fitted(comparison)], 5
         for _ in range(rounds):
-            one = one._straightened(comparison, everything)
-            best = max(best, one, key=lambda fit: fit._gain(comparison))
-        return best._trimmed(comparison, everything)
+            tried.append(tried[-1]._straightened(comparison))
+        return max(tried, key=lambda fit: fit._gain(comparison))._trimmed(comparison)
 
     def _gain(self, comparison: Comparison) -> float:
         """Log likelihood ratio to none, nats."""
@@ -126,8 +123,8 @@ class Chirp(Transient):
         """Nats that so many numbers gain by chance, and more."""
         return NATS_PER_NUMBER * (2 * len(self.time_s) + int(self.cosine.any(0).sum()))
 
-    def _fitted(self, comparison: Comparison, keep: Tensor) -> Chirp:
-        """With the amplitudes of the samples to keep `(time,)`, of one source."""
+    def _fitted(self, comparison: Comparison, keep: Tensor | None = None) -> Chirp:
+        """With the amplitudes of the samples to keep `(time,)`, by default of all, of one source."""
         gram, seen = self._normal_equations(comparison, keep)
         amplitude = torch.linalg.solve(gram.to(seen.dtype), seen)  # (knot, sensor)
         if comparison.n_sensors > 1:
@@ -136,12 +133,12 @@ class Chirp(Transient):
             amplitude = s[0] * u[:, :1] * v[:1] * scale
         return replace(self, cosine=amplitude.real, sine=-amplitude.imag)
 
-    def _normal_equations(self, comparison: Comparison, keep: Tensor) -> tuple[Tensor, Tensor]:
+    def _normal_equations(self, comparison: Comparison, keep: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Of the amplitudes at the knots, `(knot, knot)` and `(knot, sensor)`."""
         first, inside, weights, turn = self._basis(comparison.n_samples, comparison.info.rate)
         here = slice(first, first + len(turn))
         signal = comparison.recording[:, here] - comparison.recording.mean(-1, keepdim=True)
-        kept = keep[here].to(torch.float64)
+        kept = torch.ones(len(turn), dtype=torch.float64) if keep is None else keep[here].to(torch.float64)
         k = len(self.time_s)
         gram = torch.zeros(k, k, dtype=torch.float64)
         seen = torch.zeros(k, comparison.n_sensors, dtype=torch.complex128)
@@ -155,17 +152,21 @@ class Chirp(Transient):
 
     def _beyond_noise(self, comparison: Comparison) -> float:
         """Factor of the amplitude that is not what noise makes of one course at so many knots."""
-        gram, _ = self._normal_equations(comparison, torch.ones(comparison.n_samples, dtype=torch.bool))
-        by_noise = 4 * float(torch.linalg.inv(gram).diagonal().mean())
+        by_noise = float(self._by_noise(comparison).mean())
         seen = float((self._level().square() / self._noise(comparison)).sum())
         return math.sqrt(max(1 - by_noise / max(seen, 1e-300), 0.0))
+
+    def _by_noise(self, comparison: Comparison) -> Tensor:
+        """Squared amplitude that noise makes of one course at each knot, in units of its density, `(knot,)`."""
+        gram, _ = self._normal_equations(comparison)
+        return 4 * torch.linalg.inv(gram).diagonal()
 
     def _shrunk(self, comparison: Comparison, there: Tensor) -> Chirp:
         """In some sensors `(sensor,)`, and by as much smaller as noise has a share of the power of its amplitudes."""
         share = self._beyond_noise(comparison) ** 2 * there
         return replace(self, cosine=self.cosine * share, sine=self.sine * share)
 
-    def _straightened(self, comparison: Comparison, keep: Tensor) -> Chirp:
+    def _straightened(self, comparison: Comparison) -> Chirp:
         """With what the phases of neighbouring amplitudes say of the frequency between them."""
         amplitude = torch.complex(self.cosine, -self.sine)
         weight = 1 / self._noise(comparison)
@@ -176,20 +177,18 @@ class Chirp(Transient):
         off = torch.where(both.abs() * step > loud, both, smooth).angle() / (2 * math.pi * self.time_s.diff())
         off = torch.cat([off[:1], (off[1:] + off[:-1]) / 2, off[-1:]])
         moved = replace(self, frequency_hz=(self.frequency_hz + off).clamp(min=0.0, max=comparison.info.rate / 2))
-        return moved._fitted(comparison, keep)
+        return moved._fitted(comparison)
 
-    def _trimmed(self, comparison: Comparison, keep: Tensor) -> Chirp:
+    def _trimmed(self, comparison: Comparison) -> Chirp:
         """Without the knots of either end in which noise has as much power, but one."""
-        gram, _ = self._normal_equations(comparison, keep)
-        by_noise = 4 * torch.linalg.inv(gram).diagonal()
         power = ((self.cosine.square() + self.sine.square()) / self._noise(comparison)).sum(-1)
-        beyond = torch.nn.functional.pad(power / by_noise, (1, 1))
+        beyond = torch.nn.functional.pad(power / self._by_noise(comparison), (1, 1))
         there = ((beyond[:-2] + beyond[1:-1] + beyond[2:]) > 8).nonzero()[:, 0]  # of noise 3 on average
         if len(there) < 2:
             return self
         kept = slice(max(int(there[0]) - 1, 0), int(there[-1]) + 2)
         time, frequency, cosine, sine = (x[kept] for x in (self.time_s, self.frequency_hz, self.cosine, self.sine))
-        return Chirp(time, frequency, cosine, sine)._fitted(comparison, keep)
+        return Chirp(time, frequency, cosine, sine)._fitted(comparison)
 
     def _noise(self, comparison: Comparison) -> Tensor:
         """Density of the noise in the middle of the course, per sample `(sensor,)`."""

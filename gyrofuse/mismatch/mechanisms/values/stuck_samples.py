@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.detectors.values.values import repeated, repeats
+from gyrofuse.mismatch.detectors.values.values import repeated, repeats, repeats_so_far
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
@@ -163,7 +163,7 @@ class StuckSamples(Mechanism):
         held = torch.zeros(same.shape, dtype=torch.float64)
         for i in self.probability.nonzero()[:, 0].tolist():
             seen = _longest_by_chance(len(same[i]), float(chance[i])) if self._hangs_beside_chance(i) else 1.0
-            before = torch.nn.functional.pad(_lengths_so_far(same[i])[:-1], (1, 0)) >= seen
+            before = torch.nn.functional.pad(repeats_so_far(same[i])[:-1], (1, 0)) >= seen
             held[i] = torch.where(before, 1 - leave[i], enter[i] if seen == 1 else 0.0)
         chance = chance[:, None]
         stuck = (chance + held * (1 - chance)).clamp(min=1e-9, max=1 - 1e-9)
@@ -195,12 +195,6 @@ def _rows(n: int, enter: float, leave: float, generator: torch.Generator) -> Ten
         held |= change[:-1].cumsum(0) > 0
         at = int(ends[-1])
     return held
-
-
-def _lengths_so_far(same: Tensor) -> Tensor:
-    """How many repeats one after the other each sample ends, `(time,)`."""
-    place = torch.arange(1, len(same) + 1)
-    return place - torch.where(same, 0, place).cummax(-1).values
 
 
 def _mean_row(same: Tensor, chance: float, probability: float) -> float:
