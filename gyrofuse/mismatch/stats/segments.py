@@ -25,6 +25,11 @@ CHI2_MEDIAN = 0.4549364231195724  # median of the square of a standard normal va
 _SHORTEST = 16  # samples of a segment: the variance of fewer is known to no better than a factor of two at 95 %
 
 
+def runs_of(true: Tensor) -> Tensor:
+    """First sample of each run of true entries of `(time,)`, and the one after its last, `(run, 2)`."""
+    return pad(true.to(torch.int8), (1, 1)).diff().nonzero().view(-1, 2)
+
+
 class Episode(NamedTuple):
     """First sample, and the one after the last."""
 

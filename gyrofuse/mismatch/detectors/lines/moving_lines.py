@@ -26,6 +26,7 @@ from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.psd import light_taper
 from gyrofuse.mismatch.signals.records import Records
 from gyrofuse.mismatch.stats.multiplicity import p_value_beyond_reference, p_value_from_e_value, sidak
+from gyrofuse.mismatch.stats.segments import runs_of
 
 _MOVES = 4  # bins from one segment to the next, at most
 _LOWEST = 3  # bin: the taper's main lobe around zero
@@ -52,11 +53,8 @@ class MovingLine(NamedTuple):
         """Whether it is there at a sample and a frequency, to three bins, and for many segments around."""
         at, many, near = sample // self.length, 16, 3.0
         there = ((self.path - frequency).abs() < near / self.length)[max(at - 1, 0) : at + 2]
-        on = ~self.path.isnan()
-        before, after = (~on[: at + 1]).nonzero()[:, 0], (~on[at:]).nonzero()[:, 0]
-        first = int(before[-1]) + 1 if len(before) else 0
-        last = at + int(after[0]) if len(after) else len(on)
-        return bool(there.any()) and last - first >= many
+        lasts = any(a <= at < b and b - a >= many for a, b in runs_of(~self.path.isnan()).tolist())
+        return bool(there.any()) and lasts
 
 
 def moving_line_test(comparison: Comparison) -> TestResult:

@@ -22,6 +22,7 @@ from gyrofuse.mismatch.signals.lines import whitened
 from gyrofuse.mismatch.stats.inclusion import included_sensors
 from gyrofuse.mismatch.stats.limits import Z
 from gyrofuse.mismatch.stats.multiplicity import sidak
+from gyrofuse.mismatch.stats.segments import runs_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -248,11 +249,9 @@ def _course(line: MovingLine, n_samples: int) -> tuple[Tensor, Tensor] | None:
 
     It moves by a quarter at least, and back and forth by twice as much as from end to end at most.
     """
-    on = ~line.path.isnan()
-    edges = torch.nn.functional.pad(on.to(torch.int8), (1, 1)).diff().nonzero()[:, 0].tolist()
     fewest = 8  # segments of a path, and bins that it moves by
     best: tuple[Tensor, Tensor] | None = None
-    for a, b in zip(edges[::2], edges[1::2], strict=True):
+    for a, b in runs_of(~line.path.isnan()).tolist():
         path = line.path[a:b]
         reach = float(path.max() - path.min())
         if b - a < fewest or float(path.max()) < _MOVES * float(path.min()) or reach * line.length < fewest:

@@ -22,6 +22,7 @@ from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.stats.inclusion import included_sensors
 from gyrofuse.mismatch.stats.limits import Z
+from gyrofuse.mismatch.stats.segments import runs_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -207,8 +208,7 @@ def _spells(comparison: Comparison, frequency: float, noise: Tensor) -> list[tup
     on = _on((_gains(z) @ z).abs().square())
     if not bool(on.any()) or bool(on.all()):
         return []
-    edges = torch.nn.functional.pad(on.to(torch.int8), (1, 1)).diff().nonzero()[:, 0].tolist()
-    spells = [(a * block, min(b * block, n)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    spells = [(a * block, min(b * block, n)) for a, b in runs_of(on).tolist()]
     return spells if len(spells) <= most else []
 
 

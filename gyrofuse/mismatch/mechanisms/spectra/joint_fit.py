@@ -31,6 +31,7 @@ from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED, in_fold
 from gyrofuse.mismatch.stats.multiplicity import e_value_of, sidak
+from gyrofuse.mismatch.stats.segments import runs_of
 
 # Share of the discrepancy that terms have to explain to be named though their form is not quite the recording's: of
 # twenty-one filters of other forms than the catalogue's they explained 95 % at least.
@@ -142,8 +143,7 @@ def _independent(comparison: Comparison) -> bool:
 
 def run_length(keep: Tensor) -> int:
     """Length of the shortest run of samples kept, of which the others are multiples."""
-    edges = torch.nn.functional.pad(keep.to(torch.int8), (1, 1)).diff().nonzero()[:, 0]
-    return int(edges.diff()[::2].min())
+    return int(runs_of(keep).diff().min())
 
 
 @derived

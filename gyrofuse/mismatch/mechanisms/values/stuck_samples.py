@@ -18,6 +18,7 @@ from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples, held_out_blocks
 from gyrofuse.mismatch.stats.limits import Z
 from gyrofuse.mismatch.stats.multiplicity import sidak
+from gyrofuse.mismatch.stats.segments import runs_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -173,8 +174,7 @@ class StuckSamples(Mechanism):
 
 def run_lengths(true: Tensor) -> Tensor:
     """Lengths of the runs of true entries of `(time,)`, `(run,)`."""
-    edges = torch.nn.functional.pad(true.to(torch.int8), (1, 1)).diff().nonzero()[:, 0]
-    return edges.diff()[::2].to(torch.float64)
+    return runs_of(true).diff()[:, 0].to(torch.float64)
 
 
 def _rows(n: int, enter: float, leave: float, generator: torch.Generator) -> Tensor:
@@ -223,8 +223,7 @@ def _fill(signal: Tensor, simulated: Tensor, longest: float) -> None:
         longest: Length beyond which rows are replaced.
     """
     near = 16  # samples of a mean
-    same = torch.nn.functional.pad(repeated(signal).to(torch.int8), (1, 1)).diff().nonzero()[:, 0].tolist()
-    rows = [(a, b) for a, b in zip(same[::2], same[1::2], strict=True) if b - a > longest]
+    rows = [(a, b) for a, b in runs_of(repeated(signal)).tolist() if b - a > longest]
     whole = signal.clone()
     for a, b in rows:
         before, after = whole[max(a - 1 - near, 0) : a - 1], whole[b : b + near]
