@@ -54,16 +54,28 @@ def select(
             break
         progress(", ".join(kind.name for kind in stage), number / len(STAGES))
         before = len(selected)
-        for kinds in (stage, STAGES[AGAIN[number]]) if number in AGAIN else (stage,):
-            if kinds is not stage and len(selected) == before:
-                break
-            while len(selected) < _MOST:
-                best = _best_of_stage(kinds, selected, start, comparison, level, generator)
-                if best is None:
-                    break
-                selected.append(best)
-                comparison = best.finding.repair(comparison, generator)
+        comparison = _exhausted(stage, selected, start, comparison, level, generator)
+        if number in AGAIN and len(selected) > before:
+            comparison = _exhausted(STAGES[AGAIN[number]], selected, start, comparison, level, generator)
     return selected, comparison
+
+
+def _exhausted(
+    stage: tuple[type[Mechanism], ...],
+    selected: list[Selected],
+    start: Comparison,
+    comparison: Comparison,
+    level: float,
+    generator: torch.Generator,
+) -> Comparison:
+    """Recording and simulation with all of a stage repaired; what is found is added to what was."""
+    while len(selected) < _MOST:
+        best = _best_of_stage(stage, selected, start, comparison, level, generator)
+        if best is None:
+            break
+        selected.append(best)
+        comparison = best.finding.repair(comparison, generator)
+    return comparison
 
 
 def _best_of_stage(
