@@ -12,7 +12,7 @@ from scipy import signal
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse.mismatch.detectors.lines.ring_downs import ring_down_test, scanned_ring_downs
+from gyrofuse.mismatch.detectors.lines.ring_downs import p_value_beside, ring_down_test, scanned_ring_downs
 from gyrofuse.mismatch.likelihoods.damped_tone import DampedTone, Surroundings
 from gyrofuse.mismatch.mechanisms.regimes.ring_down import RingDown
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
@@ -49,6 +49,24 @@ def test_noise_rings_as_often_as_its_p_value_says():
     p_values = [scanned_ring_downs(normal(p, 4096, g=g)).p_value for p in (1, 3) for _ in range(n_runs // 2)]
     for level in (0.1, 0.01):
         assert sum(p < level for p in p_values) <= at_most(n_runs, level)
+
+
+@pytest.mark.parametrize("kind", ["Laplace", "wanders"])
+def test_noise_of_both_that_is_heavy_tailed_or_wanders_rings_no_more_often(kind: str):
+    """By Ville's bound alone one in three of those that wander has a p value below a hundredth."""
+    g, n_runs, p, n = generator(8), 16, 2, 4096
+
+    def drawn() -> Tensor:
+        if kind == "Laplace":
+            return normal(p, n, g=g) * (-torch.rand(p, n, generator=g, dtype=torch.float64).log()).sqrt()
+        steadiness = math.exp(-1 / 200)
+        course = signal.lfilter([math.sqrt(1 - steadiness**2)], [1, -steadiness], normal(p, n, g=g).numpy())
+        return normal(p, n, g=g) * torch.from_numpy(course / 2).exp()
+
+    scans = [scanned_ring_downs(drawn()) for _ in range(n_runs)]
+    p_values = [p_value_beside(own, other) for own in scans for other in scans if own is not other]
+    assert sum(p < 0.01 for p in p_values) <= 0.02 * len(p_values)
+    assert min(p_values) > 1e-4
 
 
 def test_a_line_that_wanders_and_comes_and_goes_is_no_knock_and_hides_none():

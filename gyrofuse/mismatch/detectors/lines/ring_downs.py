@@ -8,7 +8,8 @@ whose power is `a` times that of the noise has the likelihood ratio
 
     exp(a / (1 + a) v) / (1 + a)
 
-in each sensor. The mean over cells, sizes and sensors that have it exceeds `x` with probability `1/x` at most.
+in each sensor. The mean over cells, sizes and sensors that have it exceeds `x` with probability `1/x` at most. Where
+noise is heavy-tailed or wanders it does more often: the simulation's own strongest cells tell how much.
 
 A line that wanders or comes and goes is as strong in the record run backwards; of a ring-down about half is left there.
 """
@@ -30,7 +31,11 @@ from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.stats.level_scan import local_level, octave_level, octaves
-from gyrofuse.mismatch.stats.multiplicity import e_value_of_some, p_value_beyond_reference
+from gyrofuse.mismatch.stats.multiplicity import (
+    e_value_of_some,
+    p_value_beyond_largest,
+    p_value_beyond_reference,
+)
 
 
 def ring_down_test(comparison: Comparison) -> TestResult:
@@ -60,9 +65,18 @@ def ring_downs(comparison: Comparison) -> RingScan:
 
 
 def ring_down_p_value(comparison: Comparison) -> float:
-    """p value of the recording's, beyond what the simulation has itself."""
-    own = ring_downs(comparison).p_value
-    return own if own > CHANCE else p_value_beyond_reference(own, _simulated(comparison).p_value)
+    """p value of the recording's, by Ville's bound and beside the strongest cells of the simulation."""
+    own = ring_downs(comparison)
+    return own.p_value if own.p_value > CHANCE else p_value_beside(own, _simulated(comparison))
+
+
+def p_value_beside(own: RingScan, simulated: RingScan) -> float:
+    """p value of a scan of the recording beside one of the simulation, which may ring itself."""
+    strongest = torch.tensor([cell.log_ratio for cell in simulated.cells], dtype=torch.float64)
+    largest = max((cell.log_ratio for cell in own.cells), default=0.0)
+    times_as_many = own.n_cells / max(simulated.n_cells, 1)
+    beyond_all = p_value_beyond_reference(own.p_value, simulated.p_value)
+    return max(beyond_all, p_value_beyond_largest(largest, strongest, times_as_many))
 
 
 @derived
