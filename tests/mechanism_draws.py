@@ -26,14 +26,15 @@ from gyrofuse.mismatch.mechanisms.signals.channel_transfer import ChannelTransfe
 from gyrofuse.mismatch.mechanisms.signals.clock import ClockSkew
 from gyrofuse.mismatch.mechanisms.signals.g_sensitivity import GSensitivity
 from gyrofuse.mismatch.mechanisms.signals.quadratic_coupling import QuadraticCoupling
-from gyrofuse.mismatch.mechanisms.signals.ramp import Ramp
 from gyrofuse.mismatch.mechanisms.signals.scale_factor import ScaleFactor
-from gyrofuse.mismatch.mechanisms.signals.step import Step
-from gyrofuse.mismatch.mechanisms.signals.temperature import TemperatureDrift
 from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
 from gyrofuse.mismatch.mechanisms.signals.tone_amplitude import ToneSize
-from gyrofuse.mismatch.mechanisms.signals.warm_up import Decay, WarmUpTransient
-from gyrofuse.mismatch.mechanisms.slow_remainder import SlowRemainder
+from gyrofuse.mismatch.mechanisms.slow.bias_oscillation import BiasOscillation
+from gyrofuse.mismatch.mechanisms.slow.ramp import Ramp
+from gyrofuse.mismatch.mechanisms.slow.slow_remainder import SlowRemainder
+from gyrofuse.mismatch.mechanisms.slow.step import Step
+from gyrofuse.mismatch.mechanisms.slow.temperature import TemperatureDrift
+from gyrofuse.mismatch.mechanisms.slow.warm_up import Decay, WarmUpTransient
 from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
 from gyrofuse.mismatch.mechanisms.spectra.cross_talk import CrossTalk
 from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
@@ -272,6 +273,14 @@ def _(setting: Setting) -> Drawn:
     onset = int(setting.even(0.2, 0.5) * setting.n_samples) / RATE
     slope = setting.signed(6.0, 8.0) * setting.size / (setting.n_samples / RATE - onset)
     return Drawn(Ramp(slope, _none(setting), onset), {"onset": onset, **setting.of_each("slope", slope)})
+
+
+@draws(BiasOscillation)
+def _(setting: Setting) -> Drawn:
+    period = setting.n_samples / RATE / setting.even(2.5, 9.0)
+    amplitude, angle = setting.sizes(1.8, 2.4) * setting.size, setting.even(0, 2 * math.pi)
+    effect = BiasOscillation(amplitude * math.cos(angle), _none(setting), amplitude * math.sin(angle), period)
+    return Drawn(effect, {"period": period, **setting.of_each("amplitude", amplitude)})
 
 
 @draws(WarmUpTransient)

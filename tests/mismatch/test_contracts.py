@@ -25,7 +25,7 @@ from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
 from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
 from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
 from gyrofuse.mismatch.mechanisms.signals.tone_amplitude import ToneSize
-from gyrofuse.mismatch.mechanisms.slow_remainder import SlowRemainder
+from gyrofuse.mismatch.mechanisms.slow.slow_remainder import SlowRemainder
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.values.stuck_samples import StuckSamples

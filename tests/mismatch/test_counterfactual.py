@@ -17,9 +17,9 @@ from gyrofuse.mismatch.detectors.spectra.peak_fit import Oscillation
 from gyrofuse.mismatch.detectors.spectra.peaks import Stretch
 from gyrofuse.mismatch.detectors.spectra.steadiness import Steadiness, steadiness
 from gyrofuse.mismatch.mechanisms.mechanism import Alternative, Finding, Mechanism, Parameter
-from gyrofuse.mismatch.mechanisms.signals.step import Step
 from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone, amplitude_limits, line_near
-from gyrofuse.mismatch.mechanisms.signals.warm_up import WarmUpTransient
+from gyrofuse.mismatch.mechanisms.slow.step import Step
+from gyrofuse.mismatch.mechanisms.slow.warm_up import WarmUpTransient
 from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
 from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode, wandering_sd

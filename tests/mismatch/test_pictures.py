@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.catalogue import CATALOGUE
 from gyrofuse.mismatch.mechanisms.mechanism import Context, Finding, Mechanism
-from gyrofuse.mismatch.mechanisms.signals.step import Step
 from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
+from gyrofuse.mismatch.mechanisms.slow.step import Step
 from gyrofuse.mismatch.signals.comparison import Comparison, block_means
 from tests import mechanism_draws  # noqa: F401  # which draws every mechanism
 from tests.mechanism_settings import RATE, compared, concealed

@@ -74,6 +74,12 @@ def angle_counts(seed: int) -> np.ndarray:
     return noise(seed) + 0.5 * np.diff(angle, axis=-1)
 
 
+def thermostat(seed: int) -> np.ndarray:
+    x = noise(seed)
+    x[1:] += 0.12 * np.sin(2 * math.pi * T / 13 + 0.4)
+    return x
+
+
 def one_way(seed: int) -> np.ndarray:
     x = noise(seed)
     x[1] += 0.25 * x[0]
@@ -101,6 +107,9 @@ CASES = {
         {"variance_change.factor[2]": 1.7**2, "low_pass.corner[0]": 40.0},
     ),
     "angle counts": Case(angle_counts, ("quantization_noise",), {"quantization_noise.angle[0]": 0.5 / RATE}),
+    "thermostat": Case(
+        thermostat, ("bias_oscillation",), {"bias_oscillation.period": 13.0, "bias_oscillation.amplitude[2]": 0.12}
+    ),
     "one way": Case(one_way, ("cross_talk",), {"cross_talk.part_of_1[1]": 0.25}),
 }
 

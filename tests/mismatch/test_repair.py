@@ -12,8 +12,8 @@ import gyrofuse as gf
 from gyrofuse.mismatch import diagnose
 from gyrofuse.mismatch.mechanisms.coherence_remainder import CoherenceRemainder
 from gyrofuse.mismatch.mechanisms.remainder import Remainder
-from gyrofuse.mismatch.mechanisms.signals.step import Step
-from gyrofuse.mismatch.mechanisms.slow_remainder import SlowRemainder
+from gyrofuse.mismatch.mechanisms.slow.slow_remainder import SlowRemainder
+from gyrofuse.mismatch.mechanisms.slow.step import Step
 from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
 from gyrofuse.mismatch.repair.repaired_model import RepairedModel

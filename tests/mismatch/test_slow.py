@@ -30,9 +30,9 @@ from gyrofuse.mismatch.likelihoods.slow_noise import (
     slow_powers,
 )
 from gyrofuse.mismatch.likelihoods.slow_templates import Family, lagged, steps, temperatures, warm_ups
-from gyrofuse.mismatch.mechanisms.signals.step import Step
-from gyrofuse.mismatch.mechanisms.signals.temperature import TemperatureDrift
-from gyrofuse.mismatch.mechanisms.signals.warm_up import WarmUpTransient
+from gyrofuse.mismatch.mechanisms.slow.step import Step
+from gyrofuse.mismatch.mechanisms.slow.temperature import TemperatureDrift
+from gyrofuse.mismatch.mechanisms.slow.warm_up import WarmUpTransient
 from gyrofuse.mismatch.selection.held_out import score_held_out
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo, block_means
 from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum, ar1_time_constants

@@ -24,14 +24,15 @@ from gyrofuse.mismatch.mechanisms.signals.channel_transfer import ChannelTransfe
 from gyrofuse.mismatch.mechanisms.signals.clock import ClockSkew
 from gyrofuse.mismatch.mechanisms.signals.g_sensitivity import GSensitivity
 from gyrofuse.mismatch.mechanisms.signals.quadratic_coupling import QuadraticCoupling
-from gyrofuse.mismatch.mechanisms.signals.ramp import Ramp
 from gyrofuse.mismatch.mechanisms.signals.scale_factor import ScaleFactor
-from gyrofuse.mismatch.mechanisms.signals.step import Step
-from gyrofuse.mismatch.mechanisms.signals.temperature import TemperatureDrift
 from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
 from gyrofuse.mismatch.mechanisms.signals.tone_amplitude import ToneSize
-from gyrofuse.mismatch.mechanisms.signals.warm_up import WarmUpTransient
-from gyrofuse.mismatch.mechanisms.slow_remainder import SlowRemainder
+from gyrofuse.mismatch.mechanisms.slow.bias_oscillation import BiasOscillation
+from gyrofuse.mismatch.mechanisms.slow.ramp import Ramp
+from gyrofuse.mismatch.mechanisms.slow.slow_remainder import SlowRemainder
+from gyrofuse.mismatch.mechanisms.slow.step import Step
+from gyrofuse.mismatch.mechanisms.slow.temperature import TemperatureDrift
+from gyrofuse.mismatch.mechanisms.slow.warm_up import WarmUpTransient
 from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
 from gyrofuse.mismatch.mechanisms.spectra.cross_talk import CrossTalk
 from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
@@ -63,7 +64,7 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (VibrationTone, ToneInSpells, ToneSize),
     (RandomTelegraph,),
     (GradualChange,),  # where noise is louder, what is slow is known less well
-    (TemperatureDrift, WarmUpTransient, Ramp, Step),
+    (TemperatureDrift, WarmUpTransient, Ramp, Step, BiasOscillation),
     (VarianceChange,),  # to which large jumps look alike
     (
         ParameterShift,

@@ -50,6 +50,7 @@ _MECHANISMS: dict[str, Callable[[Bench, float], Part]] = {
     "random_telegraph": spectral.random_telegraph,
     "step": shapes.step,
     "ramp": shapes.ramp,
+    "bias_oscillation": shapes.bias_oscillation,
     "temperature_drift": shapes.temperature_drift,
     "warm_up_transient": _with(shapes.warm_up_transient, thermometer="board"),
     "flicker": spectral.power_law,

@@ -211,6 +211,23 @@ def ramp(bench: Bench, nats: float) -> Part:
     )
 
 
+def bias_oscillation(bench: Bench, nats: float) -> Part:
+    """The bias swings with one period, a few times in the record."""
+    sensors = bench.some_sensors(1)
+    f = bench.rng.uniform(2.2, 9.0) / bench.n * bench.rate
+    t = np.arange(bench.n) / bench.rate
+    gains = bench.gains(sensors)
+    course = np.sin(2 * np.pi * f * t + bench.rng.uniform(0, 2 * np.pi))
+    part, size = bench.shape("bias_oscillation", nats, gains[:, None] * course)
+    assert part.signal is not None
+    amplitude = size * np.abs(gains[list(sensors)])
+    return replace(
+        part,
+        look_alikes=bench.rivals(part.signal, {"warm_up_transient": warm_ups(bench), "step": steps(bench)}),
+        parameters={"amplitude": quantity(rms(amplitude), "deg/s", amplitude), "period": quantity(1 / f, "s")},
+    )
+
+
 def steps(bench: Bench) -> Array:
     """Steps at 50 epochs: (epoch, time)."""
     return (np.arange(bench.n) >= np.linspace(0.01, 0.99, 50)[:, None] * bench.n).astype(float)

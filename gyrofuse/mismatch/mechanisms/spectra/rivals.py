@@ -14,8 +14,8 @@ from gyrofuse.mismatch.likelihoods.spectra.components import Term
 from gyrofuse.mismatch.likelihoods.spectra.fit import fit
 from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios
 from gyrofuse.mismatch.mechanisms.mechanism import Finding
-from gyrofuse.mismatch.mechanisms.signals.slow_effect import SlowEffect
-from gyrofuse.mismatch.mechanisms.signals.step import Step
+from gyrofuse.mismatch.mechanisms.slow.slow_effect import SlowEffect
+from gyrofuse.mismatch.mechanisms.slow.step import Step
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import compared
 from gyrofuse.mismatch.signals.comparison import Comparison
 

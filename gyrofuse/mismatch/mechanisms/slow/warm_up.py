@@ -13,7 +13,7 @@ from gyrofuse.mismatch.detectors.slow.estimates import estimate, log_factors, on
 from gyrofuse.mismatch.detectors.slow.scans import Scan
 from gyrofuse.mismatch.likelihoods.slow_templates import Family, warm_ups
 from gyrofuse.mismatch.mechanisms.mechanism import Finding
-from gyrofuse.mismatch.mechanisms.signals.slow_effect import SlowEffect, in_seconds, slow_finding, strong_scan
+from gyrofuse.mismatch.mechanisms.slow.slow_effect import SlowEffect, in_seconds, slow_finding, strong_scan
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import OfSensors
 

@@ -76,6 +76,11 @@ class SlowEffect(Mechanism, SlowTemplates):
     def amplitudes(self) -> Tensor:
         return self.sizes
 
+    @property
+    def amplitude(self) -> Tensor:
+        """How large it is said to be, `(sensor,)`, unit of `size`."""
+        return self.size.abs()
+
     def with_amplitudes(self, amplitudes: Tensor) -> SlowEffect:
         return self.with_sizes(amplitudes)
 
@@ -240,13 +245,14 @@ def slow_finding(
         for i in which:
             value, reach = float(effect.sizes[i, path]), Z * float(found.sd[i, path])
             limits[f"{name}[{i}]"] = Parameter(value, value - reach, value + reach, unit)
-    largest = max(which, key=lambda i: abs(float(effect.size[i])))
+    up_to = effect.amplitude
+    largest = max(which, key=lambda i: float(up_to[i]))
     # A block is no more than half a wavelet there.
     levels = range(int(math.log2(comparison.n_samples / N_BLOCKS)) + 1, int(math.log2(comparison.n_samples)) + 1)
     return Finding(
         effect.name,
         effect,
-        f"the bias of {info.named(which)} {words}, by up to {abs(float(effect.size[largest])):.3g} {sizes[0][1]} "
+        f"the bias of {info.named(which)} {words}, by up to {float(up_to[largest]):.3g} {sizes[0][1]} "
         f"(sensor {info.sensors[largest]})",
         scan.p_value,
         which,

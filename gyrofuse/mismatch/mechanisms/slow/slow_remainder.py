@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.detectors.slow.scans import slow_analysis
 from gyrofuse.mismatch.likelihoods.slow_noise import best_fit
-from gyrofuse.mismatch.mechanisms.signals.slow_effect import SlowEffect
+from gyrofuse.mismatch.mechanisms.slow.slow_effect import SlowEffect
 from gyrofuse.mismatch.signals.comparison import N_BLOCKS, Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED, in_fold

@@ -15,7 +15,7 @@ from gyrofuse.mismatch.detectors.slow.surrogates import beats_surrogates
 from gyrofuse.mismatch.likelihoods.slow_templates import Family, lagged, temperatures
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding
-from gyrofuse.mismatch.mechanisms.signals.slow_effect import SlowEffect, in_seconds, slow_finding, strong_scan
+from gyrofuse.mismatch.mechanisms.slow.slow_effect import SlowEffect, in_seconds, slow_finding, strong_scan
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import OfSensors
 

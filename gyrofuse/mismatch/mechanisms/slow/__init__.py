@@ -1,0 +1,1 @@
+"""Slow courses of the bias: steps, ramps, swings, warm-ups, and what follows a temperature."""
