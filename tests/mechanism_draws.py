@@ -22,6 +22,7 @@ from gyrofuse.mismatch.mechanisms.regimes.telegraph import RandomTelegraph
 from gyrofuse.mismatch.mechanisms.regimes.tone_in_spells import ToneInSpells
 from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
 from gyrofuse.mismatch.mechanisms.remainder import Remainder
+from gyrofuse.mismatch.mechanisms.signals.channel_coupling import ChannelCoupling
 from gyrofuse.mismatch.mechanisms.signals.channel_transfer import ChannelTransfer
 from gyrofuse.mismatch.mechanisms.signals.clock import ClockSkew
 from gyrofuse.mismatch.mechanisms.signals.g_sensitivity import GSensitivity
@@ -194,6 +195,14 @@ def _(setting: Setting) -> Drawn:
     return Drawn(
         ScaleFactor("rate", error[:, None]), setting.of_each("error", 1e6 * error), {"rate": motion.reshape(1, -1)}
     )
+
+
+@draws(ChannelCoupling)
+def _(setting: Setting) -> Drawn:
+    gain = setting.signed(0.25, 0.4) * setting.size
+    held = 40  # samples
+    command = setting.normal(1, setting.n_samples // held + 1).repeat_interleave(held, -1)[:, : setting.n_samples]
+    return Drawn(ChannelCoupling("motor", gain[:, None]), setting.of_each("gain", gain), {"motor": command})
 
 
 @draws(RingDown)

@@ -141,6 +141,15 @@ def test_it_is_named_nearly_always(case: Case) -> None:
     assert right >= 10
 
 
+def test_what_follows_a_motor_is_told_as_such() -> None:
+    command = torch.from_numpy(np.repeat(np.random.default_rng(3).uniform(size=N // 512 + 1), 512)[:N])
+    late = signal.lfilter([0.02], [1, -0.98], command.numpy())
+    x = noise(4) + np.array([[2.0], [0.0], [-1.5]]) * late
+    report = diagnosed(x, None, motor=command, count=torch.arange(N, dtype=torch.float64))
+    assert [(f.mechanism, f.channel) for f in report.findings] == [("channel_coupling", "motor")]
+    assert set(report.findings[0].sensors) == {0, 2}
+
+
 def test_jumps_are_seen_beside_a_course_of_temperature() -> None:
     g = np.random.default_rng(3)
     temperature = 25 + 8 * np.sin(2 * math.pi * T / T[-1] / 0.7)

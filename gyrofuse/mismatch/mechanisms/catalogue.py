@@ -20,6 +20,7 @@ from gyrofuse.mismatch.mechanisms.regimes.telegraph import RandomTelegraph
 from gyrofuse.mismatch.mechanisms.regimes.tone_in_spells import ToneInSpells
 from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
 from gyrofuse.mismatch.mechanisms.remainder import Remainder
+from gyrofuse.mismatch.mechanisms.signals.channel_coupling import ChannelCoupling
 from gyrofuse.mismatch.mechanisms.signals.channel_transfer import ChannelTransfer
 from gyrofuse.mismatch.mechanisms.signals.clock import ClockSkew
 from gyrofuse.mismatch.mechanisms.signals.g_sensitivity import GSensitivity
@@ -58,7 +59,7 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (Quantization, Clipping, StuckSamples),  # facts on the numbers themselves
     (Spikes, ScaleMixture),
     (ClockSkew,),
-    (GSensitivity, QuadraticCoupling, ScaleFactor, ChannelTransfer),
+    (GSensitivity, QuadraticCoupling, ScaleFactor, ChannelCoupling, ChannelTransfer),
     (Chirp,),  # which passes any frequency
     (RingDown,),  # whose strongest are lines too
     (VibrationTone, ToneInSpells, ToneSize),

@@ -59,6 +59,7 @@ _MECHANISMS: dict[str, Callable[[Bench, float], Part]] = {
     "common_mode": spectral.common_mode,
     "cross_talk": spectral.cross_talk,
     "scale_factor": shapes.scale_factor,
+    "channel_coupling": shapes.channel_coupling,
     "clock_skew": shapes.clock_skew,
     "clock_lost_samples": _with(shapes.clock_skew, lost=True),
     "parameter_shift": spectral.parameter_shift,

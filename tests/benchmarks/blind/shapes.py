@@ -374,6 +374,22 @@ def scale_factor(bench: Bench, nats: float, *, constant: bool = False) -> Part:
     return part
 
 
+def channel_coupling(bench: Bench, nats: float) -> Part:
+    """The supply of some sensors sags under a motor, whose command is a channel: steps of random size and length."""
+    sensors = bench.some_sensors(1)
+    changes = np.sort(bench.rng.integers(0, bench.n, int(bench.rng.integers(8, 40))))
+    levels = bench.rng.uniform(0, 1, len(changes) + 1)
+    command = levels[np.searchsorted(changes, np.arange(bench.n), side="right")]
+    gains = bench.gains(sensors)
+    channels = {"motor_command": command}
+    part, size = bench.shape(
+        "channel_coupling", nats, gains[:, None] * command, known=True, channel="motor_command", channels=channels
+    )
+    gain = size * gains[list(sensors)]
+    part.parameters.update(gain=quantity(rms(gain), "deg/s per unit of motor_command", gain))
+    return part
+
+
 def clock_skew(bench: Bench, nats: float, *, lost: bool = False) -> Part:
     """Some sensors run on a clock of their own: a line that all share, known to the simulator, slips in phase there.
 

@@ -210,7 +210,7 @@ def _tails(statistic: Tensor, n_rows: int, informed: Tensor, left: list[Tensor])
 def channel_test(comparison: Comparison) -> TestResult:
     """Gains of the sensors on fast channels and on the products of their rows."""
     tried = []
-    for name in [*accelerations(comparison), *rates(comparison)]:
+    for name in [*accelerations(comparison), *rates(comparison), *auxiliary(comparison)]:
         rows = comparison.info.channels[name].to(torch.float64)
         rows = rows.reshape(-1, rows.shape[-1])
         kinds = [("", rows)]
@@ -221,7 +221,7 @@ def channel_test(comparison: Comparison) -> TestResult:
             if fit is not None:
                 tried.append((fit, name, words))
     if not tried:
-        return TestResult("channel", 1.0, "there is no acceleration or reference rate to compare with")
+        return TestResult("channel", 1.0, "there is no channel to compare with but temperatures, if any")
     fit, name, words = min(tried, key=lambda entry: entry[0].p_value)
     return TestResult(
         "channel",
@@ -240,6 +240,25 @@ def accelerations(comparison: Comparison) -> list[str]:
 def rates(comparison: Comparison) -> list[str]:
     """Names of the channels of a reference rate, whole ones."""
     return _channels(comparison, "rate")
+
+
+def auxiliary(comparison: Comparison) -> list[str]:
+    """Names of other channels than motion and temperature, whole ones that are more than a straight line in time."""
+    return [
+        name
+        for name, values in comparison.info.channels.items()
+        if not any(word in name.lower() for word in ("accel", "rate", "temperature"))
+        and bool(torch.isfinite(values).all())
+        and bool(_bends(values.reshape(-1, values.shape[-1]).to(torch.float64)).all())
+    ]
+
+
+def _bends(rows: Tensor) -> Tensor:
+    """Whether rows `(row, time)` are neither constant nor a count of samples, `(row,)`."""
+    time = torch.linspace(-1, 1, rows.shape[-1], dtype=rows.dtype)
+    rows = rows - rows.mean(-1, keepdim=True)
+    line = (rows @ time / time.square().sum())[:, None] * time
+    return (rows - line).abs().amax(-1) > 1e-3 * rows.abs().amax(-1)
 
 
 def squared(rows: Tensor) -> dict[str, Tensor]:
