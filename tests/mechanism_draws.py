@@ -15,6 +15,7 @@ from gyrofuse.mismatch.likelihoods.spectra.filter_forms import filter_strength
 from gyrofuse.mismatch.mechanisms.coherence_remainder import CoherenceRemainder
 from gyrofuse.mismatch.mechanisms.regimes.chirp import Chirp
 from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
+from gyrofuse.mismatch.mechanisms.regimes.pulses import Pulses
 from gyrofuse.mismatch.mechanisms.regimes.ring_down import RingDown
 from gyrofuse.mismatch.mechanisms.regimes.scale_mixture import ScaleMixture
 from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
@@ -220,6 +221,15 @@ def _(setting: Setting) -> Drawn:
     )
     truth = {"rate": 3600 * knocks / seconds, "frequency": frequency, "decay_time": decay}
     return Drawn(effect, truth | setting.of_each("amplitude", size))
+
+
+@draws(Pulses)
+def _(setting: Setting) -> Drawn:
+    n, seconds = 6, setting.n_samples / RATE  # expected in the record, all alike
+    width, size = setting.even(6.0, 20.0) / RATE, setting.signed(5.0, 7.0) * setting.size
+    one = torch.ones(1, dtype=torch.float64)
+    effect = Pulses(0 * one, width * one, one, size[None], seconds / n)
+    return Drawn(effect, {"rate": 3600 * n / seconds, "width": width} | setting.of_each("amplitude", size))
 
 
 @draws(Chirp)

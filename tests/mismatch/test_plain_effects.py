@@ -80,6 +80,22 @@ def thermostat(seed: int) -> np.ndarray:
     return x
 
 
+def shocks(seed: int) -> np.ndarray:
+    x = noise(seed)
+    for onset, sign in ((3000, 1), (9000, -1), (12_345, 1)):
+        x[:, onset : onset + 20] += (
+            sign * np.array([[8.0], [5.0], [-6.0]]) * np.sin(math.pi * (np.arange(20) + 0.5) / 20)
+        )
+    return x
+
+
+def glitches_of_three(seed: int) -> np.ndarray:
+    x = noise(seed)
+    for onset in np.random.default_rng(seed).integers(10, N - 10, 15):
+        x[0, onset : onset + 3] += np.array([9.0, 9.0, 6.0])
+    return x
+
+
 def one_way(seed: int) -> np.ndarray:
     x = noise(seed)
     x[1] += 0.25 * x[0]
@@ -110,6 +126,8 @@ CASES = {
     "thermostat": Case(
         thermostat, ("bias_oscillation",), {"bias_oscillation.period": 13.0, "bias_oscillation.amplitude[2]": 0.12}
     ),
+    "shocks": Case(shocks, ("pulses",), {"pulses.width": 20 / RATE}),
+    "glitches of three": Case(glitches_of_three, ("pulses",), {}),
     "one way": Case(one_way, ("cross_talk",), {"cross_talk.part_of_1[1]": 0.25}),
 }
 

@@ -20,6 +20,7 @@ from gyrofuse.mismatch.detectors.values.values import values_test
 from gyrofuse.mismatch.detectors.variance.haar_kurtosis import jump_test
 from gyrofuse.mismatch.detectors.variance.noise_level import variance_test
 from gyrofuse.mismatch.detectors.variance.outliers import outliers_test
+from gyrofuse.mismatch.detectors.variance.pulses import pulse_test
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.stats.multiplicity import sidak
 
@@ -31,6 +32,7 @@ TESTS: tuple[Callable[[Comparison], TestResult], ...] = (
     moving_line_test,
     clock_test,
     ring_down_test,
+    pulse_test,
     jump_test,
     slow_test,
     hysteresis_test,

@@ -144,6 +144,17 @@ class Surroundings:
         """Sizes `(path, sensor)` and log likelihood ratios `(sensor,)` of paths `(path, time)`."""
         return self._regressed(self._own, self._seen(paths))
 
+    def each(self, paths: Tensor) -> Tensor:
+        """Log likelihood ratios `(path, sensor)` of paths `(path, time)`, each by itself."""
+        y, at_once = self._own, 32
+        total = y.square().sum(-1, keepdim=True)
+        found = []
+        for some in paths.split(at_once):
+            x = self._seen(some)
+            explained = (x @ y[..., None])[..., 0].square() / x.square().sum(-1).clamp(min=1e-300)
+            found.append(y.shape[-1] / 2 * (total / (total - explained).clamp(min=1e-12 * total)).log())
+        return torch.cat(found, -1).mT
+
     def _regressed(self, y: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
         """Of values `(sensor, value)`, all or those that matter, and what paths show there, `(sensor, path, value)`."""
         gram = x @ x.mT
@@ -309,8 +320,6 @@ class Surroundings:
         which, n, tone = list(sensors), self.samples.shape[-1], found.tone
         t = torch.arange(n, dtype=torch.float64) + self.first - tone.onset
         y = self.white[which]
-        total = y.square().sum(-1, keepdim=True)
-        one_sample = n / 2 * (total / (total - y.square()).clamp(min=1e-12 * total)).log().sum(0).max()
         step = self.regression((t >= 0).to(torch.float64)[None])[1][which].sum()
 
         angle = 2 * math.pi * tone.frequency * t
@@ -324,7 +333,14 @@ class Surroundings:
         widths = ((1, 0.35), (1, 0.7), (1, 1.4), (2, 0.5), (2, 1.0), (2, 2.0))
         grown = [swelling(k / 2 * tone.tau, power, w * tone.tau) for k in range(-1, 5) for power, w in widths]
         lasting = _lasting(y * _turned(-angle))
-        return float(torch.stack([one_sample, step, _louder(y), *grown, lasting]).max())
+        return max(float(torch.stack([step, *grown, lasting]).max()), self.of_no_course(which))
+
+    def of_no_course(self, sensors: Sequence[int]) -> float:
+        """Log likelihood ratio of one sample that is off, or of noise that is louder for a while."""
+        y = self.white[list(sensors)]
+        total = y.square().sum(-1, keepdim=True)
+        one = y.shape[-1] / 2 * (total / (total - y.square()).clamp(min=1e-12 * total)).log().sum(0).max()
+        return float(torch.maximum(one, _louder(y)))
 
 
 def _turned(angle: Tensor) -> Tensor:

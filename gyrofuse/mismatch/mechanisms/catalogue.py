@@ -13,6 +13,7 @@ from gyrofuse.mismatch.mechanisms.coherence_remainder import CoherenceRemainder
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.mechanisms.regimes.chirp import Chirp
 from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
+from gyrofuse.mismatch.mechanisms.regimes.pulses import Pulses
 from gyrofuse.mismatch.mechanisms.regimes.ring_down import RingDown
 from gyrofuse.mismatch.mechanisms.regimes.scale_mixture import ScaleMixture
 from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
@@ -61,7 +62,7 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (ClockSkew,),
     (GSensitivity, QuadraticCoupling, ScaleFactor, ChannelCoupling, ChannelTransfer),
     (Chirp,),  # which passes any frequency
-    (RingDown,),  # whose strongest are lines too
+    (RingDown, Pulses),  # whose strongest are lines too
     (VibrationTone, ToneInSpells, ToneSize),
     (RandomTelegraph,),
     (GradualChange,),  # where noise is louder, what is slow is known less well

@@ -33,6 +33,7 @@ _MECHANISMS: dict[str, Callable[[Bench, float], Part]] = {
     "vibration_tone": shapes.vibration_tone,
     "tone_in_spells": shapes.tone_in_spells,
     "ring_down": shapes.ring_down,
+    "pulses": shapes.pulses,
     "chirp": strange.chirp,
     "drifting_tone": shapes.drifting_tone,
     "resonance": spectral.resonance,

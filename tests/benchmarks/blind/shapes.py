@@ -117,6 +117,23 @@ def ring_down(bench: Bench, nats: float) -> Part:
     )
 
 
+def pulses(bench: Bench, nats: float) -> Part:
+    """Shocks that do not ring: half sines, haversines or sawteeth, at times that are not known beforehand."""
+    sensors, n_pulses = bench.some_sensors(2), int(bench.rng.integers(1, 6))
+    width = math.exp(bench.rng.uniform(math.log(4), math.log(60))) / bench.rate  # s
+    t = np.arange(bench.steps) / bench.step_rate
+    onsets = np.sort(bench.rng.uniform(0.02, 0.95, n_pulses)) * bench.duration
+    form = [lambda u: np.sin(np.pi * u), lambda u: np.sin(np.pi * u) ** 2, lambda u: np.minimum(3 * u, 1.5 * (1 - u))]
+    course, made = np.zeros(bench.steps), form[int(bench.rng.integers(3))]
+    for onset in onsets:
+        u = (t - onset) / width
+        inside = (u > 0) & (u < 1)
+        course[inside] += bench.rng.choice([-1, 1]) * bench.rng.uniform(0.7, 1.4) * made(u[inside])
+    unit = bench.sampled(bench.gains(sensors)[:, None] * course)
+    part = _at_unknown_times(bench, "pulses", nats, unit, n_pulses * math.log(bench.n))
+    return replace(part, parameters={"width": quantity(width, "s")})
+
+
 def drifting_tone(bench: Bench, nats: float) -> Part:
     """A rotor whose speed wanders by many line widths.
 

@@ -1,0 +1,206 @@
+"""Pulses: something that pushes sensors one way for some samples, and is gone: a shock, a fault of a bus."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated, ClassVar
+
+import torch
+from scipy import stats
+from torch import Tensor
+
+from gyrofuse.mismatch.decisions import NATS_AS_GOOD, NATS_PER_NUMBER
+from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
+from gyrofuse.mismatch.detectors.variance.pulses import pulse_p_value, pulses_of, scanned_pulses
+from gyrofuse.mismatch.likelihoods.damped_tone import Surroundings
+from gyrofuse.mismatch.likelihoods.pulse import FittedPulse, Pulse, fitted_pulse, other_course, sized, width_limits
+from gyrofuse.mismatch.mechanisms import pictures
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
+from gyrofuse.mismatch.mechanisms.regimes.transient import Transient
+from gyrofuse.mismatch.signals.comparison import Comparison
+from gyrofuse.mismatch.signals.dims import Dims
+from gyrofuse.mismatch.signals.folds import N_FOLDS
+from gyrofuse.mismatch.signals.lines import whitened
+from gyrofuse.mismatch.stats.inclusion import included_sensors
+from gyrofuse.mismatch.stats.limits import Z
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+@dataclass(frozen=True, eq=False)
+class Pulses(Transient):
+    """`x_i(t) = sum_m amplitude_mi sin(pi u)^q_m`, `u = (t - t_m) / width_m` from 0 to 1, at random.
+
+    Half sines, haversines, and next to rectangles. Looks like spikes, which are gone after a sample; like what rings,
+    which goes to and fro; like steps, which stay; and like switching between two levels, whose stays are of any length.
+
+    Attributes:
+        onset_s: `t_m`, s after the first sample, `(pulse,)`.
+        width_s: `(pulse,)`.
+        power: `q_m`, `(pulse,)`.
+        size: `(pulse, sensor)`, unit of the signal; 0 in sensors that do not have it.
+        duration_s: Of the recording in which so many were.
+    """
+
+    name: ClassVar[str] = "pulses"
+    separated_by: ClassVar[str] = "more pulses"
+    time_words: ClassVar[str] = "strongest at"
+    onset_s: Annotated[Tensor, Dims(("pulse",))]
+    width_s: Annotated[Tensor, Dims(("pulse",))]
+    power: Annotated[Tensor, Dims(("pulse",))]
+    size: Annotated[Tensor, Dims(("pulse", "sensor"))]
+    duration_s: float
+
+    @classmethod
+    def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
+        p_value = pulse_p_value(comparison)
+        if p_value > level:
+            return None
+        pulses = _pulses(comparison)
+        if not pulses or _to_and_fro(pulses) or _of_any_length(pulses):
+            return None
+        info, rate = comparison.info, comparison.info.rate
+        effect = cls.of(pulses, comparison)
+        strongest = max(pulses, key=lambda one: float(one.log_ratio.sum()))
+        around = _around(comparison, comparison.recording, strongest.pulse)
+        width, hours = strongest.pulse.width / rate, effect.duration_s / 3600
+        fewest, most = (stats.chi2.ppf(q, 2 * (len(pulses) + more)) / 2 for q, more in ((0.025, 0), (0.975, 1)))
+        shortest, longest = width_limits(around, strongest)
+        parameters = {
+            "rate": Parameter(len(pulses) / hours, float(fewest) / hours, float(most) / hours, "1/h"),
+            "width": Parameter(width, shortest / rate, longest / rate, "s"),
+        }
+        for i in strongest.amplitude.nonzero()[:, 0].tolist():
+            value, reach = float(strongest.amplitude[i]), Z * float(strongest.sd[i])
+            parameters[f"amplitude[{i}]"] = Parameter(value, value - reach, value + reach, info.measure)
+        concerned = tuple((effect.size != 0).any(0).nonzero()[:, 0].tolist())
+        largest, onset = int(strongest.amplitude.abs().argmax()), strongest.pulse.onset / rate
+        many = "a pulse" if len(pulses) == 1 else f"{len(pulses)} pulses"
+        return Finding(
+            cls.name,
+            effect,
+            f"{many} of one sign and then gone, {len(pulses) / hours:.3g} an hour, in "
+            f"{info.named(concerned, 'all sensors')}: the strongest at {onset:.6g} s, {width:.3g} s long, of "
+            f"{float(strongest.amplitude[largest]):.3g} {info.measure} in sensor {info.sensors[largest]}, as of "
+            "a shock or a fault of transmission",
+            p_value,
+            concerned,
+            parameters,
+            levels=(level_of(min(0.5 / strongest.pulse.width, 0.5)),),
+            time_s=onset,
+            gain=float(sum(one.log_ratio.sum() for one in pulses)),
+        )
+
+    @classmethod
+    def of(cls, pulses: Sequence[FittedPulse], comparison: Comparison) -> Pulses:
+        """Of pulses that were fitted to a recording."""
+        rate = comparison.info.rate
+        onset, width, power = (
+            torch.tensor(x, dtype=torch.float64) for x in zip(*(one.pulse for one in pulses), strict=True)
+        )
+        size = torch.stack([one.amplitude for one in pulses])
+        return cls(onset / rate, width / rate, power, size, comparison.n_samples / rate)
+
+    def fit_without(self, comparison: Comparison, fold: int) -> Pulses:
+        """With the amplitudes that every fourth sample is not used for: a pulse lies in one block."""
+        left, sizes = self.remove(comparison.recording, comparison.info), list[Tensor]()
+        for pulse, size in zip(self._each(comparison.info.rate), self.size, strict=True):
+            own = left + _path(pulse, size, comparison.n_samples)
+            around = _around(comparison, own, pulse).without(fold, N_FOLDS)
+            sizes.append(sized(around, pulse, size.nonzero()[:, 0].tolist()).amplitude)
+            left = own - _path(pulse, sizes[-1], comparison.n_samples)
+        return replace(self, size=torch.stack(sizes))
+
+    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+        rate, strongest = comparison.info.rate, int((self.size[:, sensor].abs() * self.width_s.sqrt()).argmax())
+        width = float(self.width_s[strongest]) * rate
+        first = round(float(self.onset_s[strongest]) * rate - 2 * width - 8)
+        path = self.path(comparison.n_samples, rate) if fitted else None
+        pictures.transient(ax, comparison, sensor, first, round(5 * width) + 24, path)
+
+    def path(self, n_samples: int, rate: float) -> Tensor:
+        path = torch.zeros(self.size.shape[-1], n_samples, dtype=torch.float64)
+        for pulse, size in zip(self._each(rate), self.size, strict=True):
+            path = path + _path(pulse, size, n_samples)
+        return path
+
+    def drawn(self, n_samples: int, rate: float, generator: torch.Generator) -> Tensor:
+        """Pulses at random, each one of those that were found."""
+        expected = torch.tensor(len(self.size) * n_samples / rate / self.duration_s, dtype=torch.float64)
+        which = torch.randint(len(self.size), (int(torch.poisson(expected, generator=generator)),), generator=generator)
+        onset = torch.rand(len(which), generator=generator, dtype=torch.float64) * n_samples / rate
+        drawn = {name: getattr(self, name)[which] for name in ("width_s", "power", "size")}
+        return replace(self, onset_s=onset, **drawn).path(n_samples, rate)
+
+    def _each(self, rate: float) -> list[Pulse]:
+        numbers = torch.stack([self.onset_s * rate, self.width_s * rate, self.power], -1)
+        return [Pulse(*row) for row in numbers.tolist()]
+
+
+def _pulses(comparison: Comparison) -> list[FittedPulse]:
+    """Those that stand out, the strongest of each scan first, each fitted to what the others leave."""
+    scan, found, left = pulses_of(comparison), list[FittedPulse](), comparison.recording
+    rounds, most, most_doubtful, n = 4, 200, 6, comparison.n_samples
+    for _ in range(rounds):
+        doubtful, new, by_chance = list[FittedPulse](), list[FittedPulse](), math.log(scan.n_cells)
+        for cell in scan.cells:
+            if cell.log_ratio < by_chance or len(found) + len(new) >= most or len(doubtful) >= most_doubtful:
+                break
+            around = Surroundings.of(left, comparison.base, cell.onset, float(cell.length))
+            one = fitted_pulse(around, cell.onset, cell.length, range(comparison.n_sensors))
+            one = sized(around, one.pulse, included_sensors(2 * one.log_ratio, 1).positions)
+            if float(one.log_ratio.sum()) < by_chance + NATS_AS_GOOD:
+                continue
+            (new if _is_one(around, one) else doubtful).append(one)
+            left = left - _path(one.pulse, one.amplitude, n)
+        for one in doubtful:  # beside another one that was not known yet, either seems to be something else
+            own = left + _path(one.pulse, one.amplitude, n)
+            if _is_one(_around(comparison, own, one.pulse), one):
+                new.append(one)
+            else:
+                left = own
+        found += new
+        if not new:
+            break
+        scan = scanned_pulses(whitened(left, comparison.base))
+    return found
+
+
+def _is_one(around: Surroundings, one: FittedPulse) -> bool:
+    """Whether no other course explains as much."""
+    there = sized(around, one.pulse, one.amplitude.nonzero()[:, 0].tolist())
+    return float(there.log_ratio.sum()) > other_course(around, there) + NATS_PER_NUMBER
+
+
+def _to_and_fro(pulses: Sequence[FittedPulse]) -> bool:
+    """Whether most of them are half waves of something that goes to and fro."""
+    near = 4  # widths
+    in_time = sorted(pulses, key=lambda one: one.pulse.onset)
+    beside = [
+        b.pulse.onset - a.pulse.onset < near * max(a.pulse.width, b.pulse.width) for a, b in itertools.pairwise(in_time)
+    ]
+    return sum(beside) > len(pulses) / 2
+
+
+def _of_any_length(pulses: Sequence[FittedPulse]) -> bool:
+    """Whether stays are of any length, as those of what switches are: as exponential values are, or more."""
+    fewest, spread = 8, 0.9  # of the logarithms: of exponential values 1.28
+    widths = torch.tensor([one.pulse.width for one in pulses], dtype=torch.float64)
+    return len(widths) >= fewest and float(widths.log().std()) > spread
+
+
+def _around(comparison: Comparison, recording: Tensor, pulse: Pulse) -> Surroundings:
+    return Surroundings.of(recording, comparison.base, round(pulse.onset), pulse.width)
+
+
+def _path(pulse: Pulse, size: Tensor, n_samples: int) -> Tensor:
+    """`(sensor, time)`."""
+    path = torch.zeros(len(size), n_samples, dtype=torch.float64)
+    first, end = max(math.floor(pulse.onset), 0), min(math.ceil(pulse.onset + pulse.width) + 1, n_samples)
+    if end > first:
+        path[:, first:end] = size[:, None] * pulse.path(first, end - first)
+    return path
