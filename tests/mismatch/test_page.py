@@ -22,7 +22,8 @@ from gyrofuse.mismatch.repair.inputs import prepared
 from gyrofuse.mismatch.reporting import text as telling
 from gyrofuse.mismatch.reporting.figures_data import compared_powers, compared_variances, grouped_spectrum
 from gyrofuse.mismatch.reporting.page import mismatch_page
-from gyrofuse.mismatch.reporting.plots import ends_of_colours, plot_map
+from gyrofuse.mismatch.reporting.plots import ends_of_colours, plot_map, plot_shares
+from gyrofuse.mismatch.selection.shares import Share
 from gyrofuse.mismatch.signals.comparison import Comparison
 
 pytestmark = pytest.mark.usefixtures("blank_images")
@@ -191,6 +192,29 @@ def test_map_marks_what_chance_does_not_give_and_greys_what_is_unknown():
     assert ax.collections[0].norm.vmax == 7.0
     assert ends_of_colours(torch.tensor([0.5]), torch.tensor([100.0])) == 12.0
     assert ends_of_colours(torch.tensor([torch.nan])) == ends_of_colours(torch.tensor([0.5])) == 4.0
+
+
+def test_shares_are_bars_from_zero_that_add_up():
+    """And what is below 0, or left below 0, is said to be so, and why."""
+    from matplotlib.figure import Figure
+
+    shares = (Share("quantization", True, 9.0, -1 / 7), Share("vibration_tone", True, 0.5, 8.5 / 7))
+    ax = plot_shares(8.0, shares, ax=Figure().subplots())
+    bars = [bar.get_width() for bar in ax.patches]
+    assert bars == pytest.approx([-100 / 7, 850 / 7, -50 / 7])
+    assert all(bar.get_x() == 0 for bar in ax.patches)
+    assert [text.get_text() for text in ax.texts] == ["-14.3 %   (8 → 9)", "121 %   (9 → 0.5)", "-7.14 %   (0.5)"]
+    held_out = report().held_out._replace(before=8.0, after=0.5, shares=shares)
+    told = dataclasses.replace(report(), held_out=held_out)
+    assert telling.share_words(told) == [
+        "Of the discrepancy above noise alone, 7 on data held out, mechanisms with names carry 107 %; nothing is left: "
+        "it is closer than noise alone is on average"
+    ]
+    assert "A share is below 0 where" in page(told).text
+    curve = shares[0]._replace(identified=False)
+    (words,) = telling.share_words(dataclasses.replace(told, held_out=held_out._replace(shares=(curve, shares[1]))))
+    assert "curves without a name -14.3 %; nothing is left" in words
+    assert "below 0 %: these repairs by themselves take the simulation further away" in words
 
 
 def test_wavelet_variances_are_those_of_both_sides():

@@ -65,9 +65,12 @@ def share_words(outcome: Outcome) -> list[str]:
     unnamed = 100 * sum(share.share for share in shares if not share.identified)
     left = 100 - named - unnamed
     known = f", curves without a name {unnamed:.3g} %" if any(not share.identified for share in shares) else ""
+    rest = f"{left:.3g} % is left" if left > 0 else "nothing is left: it is closer than noise alone is on average"
+    if min(named, unnamed) < 0:
+        rest += " (below 0 %: these repairs by themselves take the simulation further away, and others make up for it)"
     return [
         f"Of the discrepancy above noise alone, {before - 1:.3g} {where}, mechanisms with names carry {named:.3g} %"
-        f"{known}; {left:.3g} % is left"
+        f"{known}; {rest}"
     ]
 
 
