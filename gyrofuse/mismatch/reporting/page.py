@@ -34,6 +34,7 @@ from gyrofuse.mismatch.reporting.text import (
     nats,
     otherwise_words,
     parameter_words,
+    typeset,
     verdict,
 )
 from gyrofuse.mismatch.selection.shares import Share
@@ -77,7 +78,7 @@ def mismatch_page(outcome: Outcome, *, title: str, remarks: Sequence[str] = ()) 
         outcome=outcome,
         family_words=family_words,
         info=info,
-        verdict=[_typeset(sentence) for sentence in verdict(outcome)],
+        verdict=[typeset(sentence) for sentence in verdict(outcome)],
         remarks=remarks,
         shares=image(_WIDTH, 0.8 + 0.26 * (len(shares) + 1), _draw_shares, before, shares) if shares else None,
         judge=judge,
@@ -135,7 +136,7 @@ def _part(outcome: Outcome, finding: Finding) -> dict[str, Any]:
     }
     return {
         "name": readable(finding.mechanism),
-        "sentence": _typeset(capital(finding.sentence)),
+        "sentence": typeset(capital(finding.sentence)),
         "facts": {name: value for name, value in facts.items() if value},
         "picture": image(_WIDTH, 2 * _PICTURE, _draw_finding, finding),
         "parameters": [
@@ -147,11 +148,6 @@ def _part(outcome: Outcome, finding: Finding) -> dict[str, Any]:
             for name in finding.alternatives
         ],
     }
-
-
-def _typeset(sentence: str) -> str:
-    """With arrows that no line is broken in."""
-    return sentence.replace("->", "→")
 
 
 def _times(levels: tuple[int, ...], rate: float) -> str:

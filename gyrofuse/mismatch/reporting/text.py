@@ -153,6 +153,11 @@ def capital(sentence: str) -> str:
     return sentence[:1].upper() + sentence[1:].rstrip(".")
 
 
+def typeset(sentence: str) -> str:
+    """With arrows that no line is broken in."""
+    return sentence.replace("->", "→")
+
+
 def family_words(held_out: HeldOut) -> str:
     """Held-out log scores, likelihood by likelihood: each is of data of its own, and they are not added up."""
     return ", ".join(
