@@ -98,11 +98,31 @@ def test_the_page_names_every_witness_and_what_was_ruled_out():
     for before, after in zip(report().evidence, report().evidence_after, strict=True):
         row = next(row for row in told.rows if row[0] == before.test.replace("_", " "))
         assert float(row[1]) == pytest.approx(before.p_value, rel=0.06)
-        assert float(row[2]) == pytest.approx(after.p_value, rel=0.06)
-        assert telling.capital(before.words) in row[3]
+        assert row[2] == telling.chance_words(before.p_value)
+        assert float(row[3]) == pytest.approx(after.p_value, rel=0.06)
+        if before.p_value < 1e-6:
+            assert row[4] == f"{telling.capital(before.words)}."
+        elif before.p_value > 0.01 and before.sensors:
+            assert row[4] == f"Nothing beyond chance; most extreme: {before.words}."
+        else:
+            assert before.words[1:] in row[4]
     assert "Looked for and not found" in told.text
     assert "After the repair no test sees a difference." in told.text
     assert "Unexplained" not in told.text
+
+
+@pytest.mark.parametrize(
+    ("p_value", "told"),
+    [
+        (1.0, "10 of 10"),
+        (0.34, "3 of 10"),
+        (0.004, "1 of 250"),
+        (3.3e-6, "1 of 300 000"),
+        (0.0, "less than 1 of a million"),
+    ],
+)
+def test_a_p_value_is_said_as_a_count(p_value: float, told: str):
+    assert telling.chance_words(p_value) == told
 
 
 def test_what_is_left_and_what_cannot_be_told_apart_is_said():
@@ -164,6 +184,15 @@ def test_no_line_breaks_within_an_arrow():
     assert "->" not in told
 
 
+def test_words_are_explained_at_the_foot_of_the_page():
+    told = page(report())
+    assert "details" in told.tags
+    foot = told.text[told.text.index("What the words on this page mean") :]
+    for word in ("p value", "held out", "nats", "discrepancy", "area under the curve", "look-alike", "repair"):
+        assert word in foot
+    assert report().summary().endswith("explained at the foot of the page (to_html, --report).")
+
+
 def test_to_html_writes_the_page(tmp_path: Path):
     report().to_html(tmp_path / "page.html", title="Mine")
     assert "<h1>Mine</h1>" in (tmp_path / "page.html").read_text(encoding="utf-8")
@@ -211,6 +240,7 @@ def test_shares_are_bars_from_zero_that_add_up():
         "it is closer than noise alone is on average"
     ]
     assert "A share is below 0 where" in page(told).text
+    assert "A share is below 0 where" not in page(report()).text
     curve = shares[0]._replace(identified=False)
     (words,) = telling.share_words(dataclasses.replace(told, held_out=held_out._replace(shares=(curve, shares[1]))))
     assert "curves without a name -14.3 %; nothing is left" in words

@@ -44,16 +44,31 @@ def verdict(outcome: Outcome) -> list[str]:
 
 
 def otherwise_words(finding: Finding) -> str:
-    """What would be with its best look-alike in the place of a finding; nothing where it has none."""
-    if finding.instead is None or finding.gain_without is None:
+    """What its closest look-alike in the place of a finding says of its name; nothing where it has none."""
+    rival = finding.instead
+    if rival is None or finding.gain_without is None:
         return ""
-    less, sd = finding.gain_without - finding.instead.gain, finding.instead.sd
-    start = f"instead of {readable(finding.mechanism)}: {readable(finding.instead.mechanism)}"
-    alike = "cannot be told from it, and " if finding.instead.mechanism in finding.alternatives else ""
-    if finding.instead.beats(finding.gain_without):
-        alike = "is likelier, and "
-    more = f"{nats(abs(less))} nats {'less' if less >= 0 else 'more'}"
-    return f"{start} {alike}would gain {more} (held out, standard deviation {nats(sd)})"
+    less = finding.gain_without - rival.gain
+    start = f"closest look-alike of {readable(finding.mechanism)}: {readable(rival.mechanism)}, which in its place"
+    size = f"by {nats(abs(less))} nats (standard deviation {nats(rival.sd)})"
+    better = f"predicts held-out data {'worse' if less >= 0 else 'better'} {size}"
+    if rival.beats(finding.gain_without):
+        return f"{start} {better}: the name given here is in doubt"
+    if rival.mechanism in finding.alternatives:
+        return f"{start} {better}: these data do not tell which of the two it is"
+    if rival.gain <= 0:
+        return f"{start} explains nothing of the held-out data"
+    return f"{start} {better}: it is ruled out"
+
+
+def chance_words(p_value: float) -> str:
+    """How often chance alone gives as small a p value: `1 of 250`."""
+    certain, many = 1e-6, 0.1  # below which numbers mean nothing to readers, and from which tenths are said
+    if p_value < certain:
+        return "less than 1 of a million"
+    if p_value >= many:
+        return f"{round(10 * p_value)} of 10"
+    return f"1 of {float(f'{1 / p_value:.2g}'):,.0f}".replace(",", " ")
 
 
 def share_words(outcome: Outcome) -> list[str]:
