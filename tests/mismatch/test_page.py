@@ -93,6 +93,15 @@ def test_the_page_has_every_parameter_with_limits_and_unit():
         assert low < high  # enough digits
 
 
+def test_the_amplitude_of_the_sentence_is_that_of_the_table():
+    """Noise adds to the squares of amplitudes, and only the table's was without that."""
+    finding = gf.diagnose(gf.Recording(drawn(N, 1) + 0.4 * tone(), rate=RATE, unit="deg/s"), NOISE).findings[0]
+    sizes = {name: entry.value for name, entry in finding.parameters.items() if name.startswith("amplitude")}
+    name = max(sizes, key=sizes.__getitem__)
+    assert f"of amplitude up to {sizes[name]:.3g} deg/s (sensor {int(name[-2]) + 1})" in finding.sentence
+    assert f"{float(finding.effect.amplitude[int(name[-2])]):.3g}" not in finding.sentence
+
+
 def test_the_page_names_every_witness_and_what_was_ruled_out():
     told = page(report())
     for before, after in zip(report().evidence, report().evidence_after, strict=True):

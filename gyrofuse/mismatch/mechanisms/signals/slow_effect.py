@@ -234,20 +234,20 @@ def slow_finding(
     """
     info = comparison.info
     scan, sizes = strong.scan, sizes or [("size", info.measure)]
-    which = scan.sensors
+    which, of = scan.sensors, sizes[0][0]
     limits = {}
     for path, (name, unit) in enumerate(sizes[: found.size.shape[-1]]):
         for i in which:
             value, reach = float(effect.sizes[i, path]), Z * float(found.sd[i, path])
             limits[f"{name}[{i}]"] = Parameter(value, value - reach, value + reach, unit)
-    largest = max(which, key=lambda i: abs(float(effect.size[i])))
+    largest = max(which, key=lambda i: abs(limits[f"{of}[{i}]"].value))
     # A block is no more than half a wavelet there.
     levels = range(int(math.log2(comparison.n_samples / N_BLOCKS)) + 1, int(math.log2(comparison.n_samples)) + 1)
     return Finding(
         effect.name,
         effect,
-        f"the bias of {info.named(which)} {words}, by up to {abs(float(effect.size[largest])):.3g} {sizes[0][1]} "
-        f"(sensor {info.sensors[largest]})",
+        f"the bias of {info.named(which)} {words}, with a {of} of up to "
+        f"{abs(limits[f'{of}[{largest}]'].value):.3g} {sizes[0][1]} (sensor {info.sensors[largest]})",
         scan.p_value,
         which,
         {**numbers, **limits},

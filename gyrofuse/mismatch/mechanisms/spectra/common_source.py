@@ -104,8 +104,8 @@ class CommonMode(Addition):
             shape,
             sensors,
             parameters,
-            f"{_WORDS[term.kind]} common to {where} that the simulation does not have, up to "
-            f"{float(size.max()):.3g} {unit}{sign}{share}",
+            f"{_WORDS[term.kind]} common to {where} that the simulation does not have, with a gain of "
+            f"up to {float(size.max()):.3g} {unit}{sign}{share}",
         )
 
     @classmethod
