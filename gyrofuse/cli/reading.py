@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gyrofuse._base.checks import check_positive, same_rate
-from gyrofuse._base.units import KNOWN_UNITS
+from gyrofuse._base.units import KNOWN_UNITS, canonical_unit, known_unit
 from gyrofuse.cli.console import say_table, warn
-from gyrofuse.cli.options import known_unit
 from gyrofuse.io.recording import Recording
 from gyrofuse.noise.array_model import ArrayModel
 from gyrofuse.noise.parsing import model_from_dict
@@ -73,13 +72,6 @@ def without_gaps(recording: Recording, done: str, fewest: int, otherwise: str = 
     ]
 
 
-def unit_note(unit: str) -> list[str]:
-    """A sentence on a unit in which no datasheet can be given."""
-    if unit in (*KNOWN_UNITS, "unknown"):
-        return []
-    return [f"Unit {unit!r} is none of {', '.join(KNOWN_UNITS)}: numbers are in it as they stand."]
-
-
 def say_notes(recording: Recording) -> None:
     """Print what was found in a recording, where there is anything."""
     rows = [(note.kind.replace("_", " "), note.stream or "-", note.sentence) for note in recording.notes]
@@ -118,7 +110,13 @@ def model_grid(path: Path) -> tuple[float | None, str | None]:
         raise ValueError(f"{path}: expected 'rate' to be a number of Hz, got {str(rate)[:80]!r}")
     if unit is not None and not isinstance(unit, str):
         raise ValueError(f"{path}: expected 'unit' to be a text such as 'deg/s', got {str(unit)[:80]!r}")
-    return rate, (None if unit == "unknown" else unit)
+    if unit in (None, "unknown"):
+        return rate, None
+    if canonical_unit(unit) not in KNOWN_UNITS:
+        raise ValueError(
+            f"{path}: expected 'unit' to be one of {', '.join(KNOWN_UNITS)}, got {unit[:80]!r}; correct it there"
+        )
+    return rate, canonical_unit(unit)
 
 
 def as_the_model(recording: Recording, path: Path) -> Recording:
@@ -181,7 +179,7 @@ def agreed_unit(model: Path | None, unit: str | None) -> str | None:
         ValueError: The two differ.
     """
     own = None if model is None else model_grid(model)[1]
-    asked = None if unit is None else known_unit(unit)
+    asked = None if unit is None else known_unit("--unit", unit)
     if None not in (asked, own) and asked != own:
         raise ValueError(f"`--unit`: expected {own}, for which the model was fitted, got {asked}; see {model}")
     return asked or own
