@@ -178,6 +178,17 @@ def test_agreement_is_told_as_such():
     assert str(report(False)) == f"Recording and simulation agree (p = {report(False).p_value:.2g}).\n{note}"
 
 
+def test_the_same_data_on_both_sides_are_told():
+    recording = observed(False)
+    with pytest.warns(UserWarning, match="Recording and simulation are the same data, sample by sample"):
+        same = gf.diagnose(recording, recording)
+    assert same.notes[0].endswith("Give another simulation.")
+    assert same.notes[0] in str(same)
+    assert same.notes[0] in page(same).text
+    with pytest.warns(UserWarning, match="Recording and judge are the same data"):
+        gf.diagnose(recording, NOISE, judge=recording)
+
+
 def test_a_difference_without_a_name_is_told_as_such():
     told = dataclasses.replace(report(), findings=(), unexplained=report().evidence[:1])
     assert "What the simulation leaves out could not be named." in page(told).text
