@@ -161,7 +161,7 @@ def open_recording(
         FileNotFoundError: No such file.
         RecordingError: The file cannot be read chunk by chunk: says what was expected, what was found, what to do.
         ValueError: A rate that is not positive, or no such quantity.
-        ImportError: A format whose library is not installed (`pip install "gyrofuse[logs]"`).
+        ImportError: A format whose library is not installed (the extra `logs`); the message names it.
     """
     check_quantity(quantity)
     found = open_slices(Path(path), key, QUANTITY[quantity])

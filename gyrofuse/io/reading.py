@@ -63,7 +63,7 @@ def read_recording(
         FileNotFoundError: No such file.
         RecordingError: The file cannot be read as a recording: says what was expected, what was found, what to do.
         ValueError: An option that does not fit the log, or a file that is named twice.
-        ImportError: A format whose library is not installed (`pip install "gyrofuse[logs]"`).
+        ImportError: A format whose library is not installed (the extra `logs`); the message names it.
     """
     paths = [Path(path)] if isinstance(path, str | Path) else [Path(p) for p in path]
     if not paths:
