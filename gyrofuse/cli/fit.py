@@ -25,7 +25,7 @@ from gyrofuse.cli.options import (
     stretch,
     takes_options,
 )
-from gyrofuse.cli.reading import at_rest, say_notes, titled
+from gyrofuse.cli.reading import at_rest, naming, say_notes, titled
 from gyrofuse.export.c_header import to_c_header
 from gyrofuse.export.kalibr import to_kalibr
 from gyrofuse.fitting.gmwm import fit_gmwm
@@ -85,7 +85,7 @@ def fit(
     others = {"kalibr": kalibr, "header": header, "model_out": model_out, "figure": figure}
     with writing.files([*logs, reading.mounting], **others) as files:
         recording = reading.read(logs)
-        with progress("fitting"):
+        with progress("fitting"), naming(logs):
             part = at_rest(recording, resting)
             fitted = partial(
                 fit_gmwm,

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,7 @@ from gyrofuse._base.checks import check_positive, same_rate
 from gyrofuse._base.units import KNOWN_UNITS, canonical_unit, known_unit
 from gyrofuse.cli.console import say_table, warn
 from gyrofuse.io.recording import Recording
+from gyrofuse.io.streams import RecordingError
 from gyrofuse.noise.array_model import ArrayModel
 from gyrofuse.noise.parsing import model_from_dict
 from gyrofuse.noise.processes import Model
@@ -25,6 +27,26 @@ _NO_MODEL = "expected a model in JSON, as to_dict() of a model gives it"
 def titled(logs: Sequence[Path]) -> str:
     """Name of a recording of one file or several, for titles and messages."""
     return logs[0].name if len(logs) == 1 else f"{logs[0].name} and {len(logs) - 1} more"
+
+
+@contextmanager
+def naming(logs: Sequence[Path]) -> Iterator[None]:
+    """Name the log in errors of what is computed of it; those of options that have nothing to do with it stay.
+
+    Args:
+        logs: Its files.
+    """
+    name, of_log = titled(logs), ("`n_levels`", "`model`", "`start`")
+    try:
+        yield
+    except RecordingError:  # has the name
+        raise
+    except ValueError as error:
+        message = str(error)
+        told = message.replace("`signal`", name).replace("`LOG`", name)
+        if told == message and (not message.startswith("`") or message.startswith(of_log)):
+            told = f"{name}: {message}"
+        raise ValueError(told) from error
 
 
 def at_rest(recording: Recording, resting: tuple[float, float] | None) -> Recording:
@@ -134,14 +156,23 @@ def on_grid(recording: Recording, path: Path, rate: float | None, unit: str | No
         unit: Its unit.
 
     Raises:
-        ValueError: Their rates differ.
+        ValueError: Their rates differ, or their units are of different quantities.
     """
+    source = ", ".join(recording.source) or "the recording"
     if rate is not None and not same_rate(rate, recording.rate):
         raise ValueError(
-            f"{path}: expected a model for the recording's {recording.rate:g} Hz, got one that was fitted at "
+            f"{path}: expected a model for the {recording.rate:g} Hz of {source}, got one that was fitted at "
             f"{rate:g} Hz; fit one at that rate, or resample the log"
         )
-    return recording if unit is None or recording.unit in ("unknown", unit) else recording.to(unit)
+    if unit is None or recording.unit in ("unknown", unit):
+        return recording
+    try:
+        return recording.to(unit)
+    except ValueError:
+        raise ValueError(
+            f"{path}: expected a model in {recording.unit}, the unit of {source}, or one that it can be converted to, "
+            f"got one in {unit}; give one that was fitted to the same quantity"
+        ) from None
 
 
 def agreed_rate(models: Sequence[Path], rate: float | None) -> float | None:

@@ -322,6 +322,22 @@ def test_a_stretch_beyond_the_log_and_a_strange_unit_are_told(run: Run, log: Pat
     refused(run(*simulate), "m.json: expected 'unit' to be one of deg/s")
 
 
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("fuse", "tiny.npz"), "tiny.npz: expected at least as many complete windows as sensors (3)"),
+        (("fit", "tiny.npz", "--model", "WN + 3*AR1"), "tiny.npz: `model`: expected at most as many parameters"),
+        (("rank", "tiny.npz"), "tiny.npz: expected at least 32 samples, got 3"),
+        (("fuse", "log.npz", "--sensors", "q"), "log.npz: `sensors`: expected some of 'a', 'b', 'c', got 'q'"),
+        (("fuse", "log.npz", "--levels", 99), "log.npz: `n_levels`: expected at most"),
+        (("rank", "log.npz", "--rest", "1e8:1e9"), "log.npz: `start`, `stop`: expected a stretch within 0 to"),
+    ],
+)
+def test_errors_name_the_log(run: Run, log: Path, tmp_path: Path, arguments: tuple[object, ...], says: str):
+    gf.Recording(gf.read_recording(log).signal[:, :3], rate=50.0, unit="deg/s").save(tmp_path / "tiny.npz")
+    refused(run(*arguments), says)
+
+
 def test_kalibr_has_a_longest_correlation_time_of_white_noise(run: Run, log: Path):
     fit = ("fit", log, "--model", "WN + AR1", "--sensors", "b")
     assert run(*fit, "--kalibr", "k.yaml", "--kalibr-slow", 7.5).status == 0
