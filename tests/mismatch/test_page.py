@@ -72,6 +72,9 @@ def test_the_page_begins_with_the_verdict():
     found = told.text.index(telling.capital(report().findings[0].sentence))
     assert told.text.index("A title") < verdict < told.text.index("Recording and simulation differ: p = ") < found
     assert "Said <i>besides</i>." in told.text
+    h = report().held_out
+    assert f"Found: vibration tone. Held-out data become likelier by {telling.nats(h.gain)} nats (spectra)" in told.text
+    assert f"discrepancy {h.before:.3g} → {h.after:.3g} (1 = noise alone)." in told.text
     assert told.tags.count("img") == 5  # one of its finding
     assert "script" not in told.tags
     assert "b" not in told.tags
@@ -168,6 +171,7 @@ def test_what_stays_is_said_once() -> None:
 def test_agreement_is_told_as_such():
     told = page(report(False))
     assert "Recording and simulation agree" in told.text
+    assert "Nothing found: recording and simulation agree (p = " in told.text
     assert "differ: p" not in told.text
     assert "Vibration tone" not in told.text
     assert "After the repair" not in told.text

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 
 from gyrofuse._base.linalg import SingularCovarianceError
 from gyrofuse._base.results import p_words, readable
@@ -14,6 +15,23 @@ from gyrofuse.mismatch.selection.held_out import HeldOut
 from gyrofuse.mismatch.selection.shares import Share
 
 ALIKE = 0.01  # relative change of a variance that is not worth a word
+
+
+def headline(outcome: Outcome) -> str:
+    """What was found, and how much better the repaired simulation is, at a glance."""
+    if not outcome.mismatch:
+        return f"Nothing found: recording and simulation agree ({p_words(outcome.p_value)})."
+    held_out = outcome.held_out
+    gains = [f"{nats(score.value)} nats ({name})" for name, score in held_out.families.items()]
+    likelier = f"Held-out data become likelier by {', '.join(gains)}; discrepancy" if gains else "Discrepancy"
+    return f"Found: {found_words(outcome)}. {likelier} {held_out.before:.3g} -> {held_out.after:.3g} (1 = noise alone)."
+
+
+def found_words(outcome: Outcome) -> str:
+    """Names of the findings, each once, with how many there are."""
+    counts = Counter(readable(f.mechanism) for f in outcome.findings)
+    words = ", ".join(name if n == 1 else f"{n} x {name}" for name, n in counts.items())
+    return words or "a difference that could not be named"
 
 
 def verdict(outcome: Outcome) -> list[str]:
