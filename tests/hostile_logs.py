@@ -184,7 +184,12 @@ def npz_sensors_that_are_bytes(folder: Path) -> Log:
 
 @case(None)
 def npz_sensors_that_are_half_characters(folder: Path) -> Log:
-    return npz(folder, gyro=GYRO, fs=100.0, sensors=np.array(["\ud800", "b", "c"]), unit=np.array("\udc00"))
+    return npz(folder, gyro=GYRO, fs=100.0, sensors=np.array(["\ud800", "b", "c"]))
+
+
+@case("expected one of the units deg/s, .*, found '.*udc00' in 1; give one with unit= ")
+def npz_unit_that_is_half_a_character(folder: Path) -> Log:
+    return npz(folder, gyro=GYRO, fs=100.0, unit=np.array("\udc00"))
 
 
 @case("`ts_hz` to be the ticks of `ts1` in a second, one number, found 0")

@@ -17,6 +17,7 @@ from torch import Tensor
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
 
 Array = NDArray[np.float64]
 Numbers = ArrayLike | Tensor
@@ -61,6 +62,8 @@ def finish(ax: Axes, handles: Sequence[Any] = (), labels: Sequence[str] = (), **
     for axis in (ax.xaxis, ax.yaxis):
         axis.label.set(color=INK, fontsize=LABEL_SIZE)
         axis.get_offset_text().set(color=INK, fontsize=TICK_SIZE)
+        if axis.get_scale() == "log":
+            _label_decades(axis)
     ax.grid(color=GRID, linewidth=0.7)
     ax.set_axisbelow(True)
     if handles:
@@ -68,6 +71,36 @@ def finish(ax: Axes, handles: Sequence[Any] = (), labels: Sequence[str] = (), **
         legend.get_frame().set(edgecolor="none", facecolor="white")
         for text in legend.get_texts():
             text.set_parse_math(False)
+
+
+def tick_text(value: float) -> str:
+    """A number on an axis: `0.01`, `200`, `1e-5`."""
+    if value == 0 or 1e-3 <= abs(value) < 1e5:
+        return f"{value:.6g}"
+    digits, exponent = f"{value:.6e}".split("e")
+    return f"{float(digits):g}e{int(exponent)}"
+
+
+def _label_decades(axis: Axis) -> None:
+    """Plain numbers at decades of a logarithmic axis, at 1, 2 and 5 where there are few; nothing in between."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+
+    class Decades(LogLocator):
+        def tick_values(self, vmin: float, vmax: float) -> Sequence[float]:
+            low, high = sorted((vmin, vmax))
+            if not low > 0:
+                return super().tick_values(vmin, vmax)
+            few, short, most = 2.5, 0.5, 8  # decades with labels in between, with even steps, and labels of all others
+            decades = np.log10(high / low)
+            if decades < short:
+                return [value for value in MaxNLocator(5, steps=[1, 2, 5, 10]).tick_values(low, high) if value > 0]
+            first, last, step = np.floor(np.log10(low)), np.ceil(np.log10(high)), np.ceil(decades / most)
+            places = 10.0 ** np.arange(step * np.floor(first / step), last + 1, step)
+            return [part * place for place in places.tolist() for part in ((1, 2, 5) if decades < few else (1,))]
+
+    axis.set_major_locator(Decades())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: tick_text(value)))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def clean_name(name: str) -> str:

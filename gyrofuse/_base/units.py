@@ -87,6 +87,23 @@ def canonical_unit(text: str) -> str:
     return _CANONICAL.get(spelling, text.strip())
 
 
+def known_unit(option: str, unit: str) -> str:
+    """Return the project's spelling of a unit that signals may have, or raise `ValueError`.
+
+    Args:
+        option: Argument that gives it, for the message.
+        unit: The unit in any spelling that `canonical_unit` knows.
+    """
+    name = canonical_unit(unit)
+    if name not in KNOWN_UNITS:
+        scale = "--scale" if option.startswith("-") else "`scale`"
+        raise ValueError(
+            f"`{option}`: expected one of {', '.join(KNOWN_UNITS)}, got {unit!r}; give one of them, and with {scale} "
+            "the factor that brings the numbers of the log to it"
+        )
+    return name
+
+
 def quantity_of(unit: str) -> str | None:
     """Return the quantity that a unit measures: `"rate"`, `"acceleration"`, or `None` for neither.
 

@@ -25,7 +25,7 @@ from gyrofuse.cli.options import (
     stretch,
     takes_options,
 )
-from gyrofuse.cli.reading import at_rest, say_notes, titled, unit_note
+from gyrofuse.cli.reading import at_rest, naming, say_notes, titled
 from gyrofuse.export.c_header import to_c_header
 from gyrofuse.export.kalibr import to_kalibr
 from gyrofuse.fitting.gmwm import fit_gmwm
@@ -85,7 +85,7 @@ def fit(
     others = {"kalibr": kalibr, "header": header, "model_out": model_out, "figure": figure}
     with writing.files([*logs, reading.mounting], **others) as files:
         recording = reading.read(logs)
-        with progress("fitting"):
+        with progress("fitting"), naming(logs):
             part = at_rest(recording, resting)
             fitted = partial(
                 fit_gmwm,
@@ -107,7 +107,7 @@ def fit(
         files.write_figure(lambda: one_panel(partial(result.plot, index=_first_fitted(result))))
         files.write_report(lambda: model_report(result, part, title=f"Noise of {titled(logs)}"))
         files.write_json(result.to_dict)
-    say("\n".join([result.summary(), *unit_note(recording.unit), *kalibr_remarks, *files.note]))
+    say("\n".join([result.summary(), *kalibr_remarks, *files.note]))
     say_notes(recording)
 
 

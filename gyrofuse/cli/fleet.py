@@ -50,7 +50,7 @@ def fleet(
         Path,
         typer.Option(
             metavar="FILE",
-            help="Where the rows go, .parquet (takes gyrofuse[logs]); a run that was stopped goes on there.",
+            help="Where the rows go, .parquet (needs pyarrow); a run that was stopped goes on there.",
         ),
     ] = Path("results.parquet"),
     task: Annotated[Kind, typer.Option(help="Task for every log.")] = Kind.fuse,

@@ -19,7 +19,7 @@ from gyrofuse.cli.options import (
     stretch,
     takes_options,
 )
-from gyrofuse.cli.reading import at_rest, say_notes, titled
+from gyrofuse.cli.reading import at_rest, naming, say_notes, titled
 from gyrofuse.cli.simulate import save_recording
 from gyrofuse.fusion.multiscale import fit_multiscale
 from gyrofuse.fusion.multiscale_result import MultiScaleResult
@@ -83,7 +83,7 @@ def fuse(
                 f"{titled(logs)}: expected several devices to fuse, found one with the axes {', '.join(recording.axes)}"
                 "; give the logs of all devices of the array"
             )
-        with progress("fusing"):
+        with progress("fusing"), naming(logs):
             part = at_rest(recording, resting)
             result: SVOResult | MultiScaleResult
             if method == "multiscale":

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 
 from gyrofuse._base.files import Outputs
-from gyrofuse._base.units import KNOWN_UNITS, canonical_unit
+from gyrofuse._base.units import known_unit
 from gyrofuse.cli.console import progress
 from gyrofuse.fusion.weights.methods import METHODS
 from gyrofuse.io.reading import read_recording
@@ -97,7 +97,7 @@ class FileReading:
             "axis": self.axis,
             "sensors": None if self.sensors is None else self.sensors.split(","),
             "rate": self.rate,
-            "unit": None if self.unit is None else known_unit(self.unit),
+            "unit": None if self.unit is None else known_unit("--unit", self.unit),
             "scale": self.scale,
             "key": self.key,
             "columns": _named_columns(self.columns),
@@ -257,17 +257,6 @@ def chosen(option: str, given: str, names: Sequence[str]) -> str:
     if given not in names:
         raise ValueError(f"`{option}`: expected one of {', '.join(names)}, got {given!r}")
     return given.replace("-", "_")
-
-
-def known_unit(unit: str) -> str:
-    """The unit that `--unit` names, in this project's spelling."""
-    name = canonical_unit(unit)
-    if name not in KNOWN_UNITS:
-        raise ValueError(
-            f"`--unit`: expected one of {', '.join(KNOWN_UNITS)}, got {unit!r}; give one of them, and with --scale the "
-            "factor that brings the numbers of the log to it"
-        )
-    return name
 
 
 def scale_weights_of(text: str) -> str | tuple[float, ...]:

@@ -21,7 +21,7 @@ from gyrofuse.cli.options import (
     stretch,
     takes_options,
 )
-from gyrofuse.cli.reading import at_rest, say_notes, titled, unit_note, without_gaps
+from gyrofuse.cli.reading import at_rest, naming, say_notes, titled, without_gaps
 from gyrofuse.fitting.ranking.rank import rank_models
 from gyrofuse.fitting.report.ranking import rank_report
 from gyrofuse.fitting.spectral.tones import FEWEST_SAMPLES
@@ -59,7 +59,7 @@ def rank(
     formulas = None if candidates is None else [formula.strip() for formula in candidates.split(",")]
     with writing.files([*logs, reading.mounting], figure=figure) as files:
         recording = reading.read(logs)
-        with progress("ranking"):
+        with progress("ranking"), naming(logs):
             asked = at_rest(recording, resting)
             part, remarks = without_gaps(asked, "Ranked", FEWEST_SAMPLES, _WITH_GAPS)
             result = rank_models(part, formulas, confidence_level=confidence_level, n_levels=levels)
@@ -75,6 +75,6 @@ def rank(
     fits = [fit for fit in result.best if fit is not None]
     if len(fits) <= _MOST_FITS:
         say("\n".join(f"\n{fit}" for fit in fits))
-    if notes := [*unit_note(recording.unit), *files.note]:
+    if notes := files.note:
         say("\n".join(notes))
     say_notes(recording)

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gyrofuse._base.checks import check_positive, same_rate
-from gyrofuse._base.units import KNOWN_UNITS
+from gyrofuse._base.units import KNOWN_UNITS, canonical_unit, known_unit
 from gyrofuse.cli.console import say_table, warn
-from gyrofuse.cli.options import known_unit
 from gyrofuse.io.recording import Recording
+from gyrofuse.io.streams import RecordingError
 from gyrofuse.noise.array_model import ArrayModel
 from gyrofuse.noise.parsing import model_from_dict
 from gyrofuse.noise.processes import Model
@@ -26,6 +27,26 @@ _NO_MODEL = "expected a model in JSON, as to_dict() of a model gives it"
 def titled(logs: Sequence[Path]) -> str:
     """Name of a recording of one file or several, for titles and messages."""
     return logs[0].name if len(logs) == 1 else f"{logs[0].name} and {len(logs) - 1} more"
+
+
+@contextmanager
+def naming(logs: Sequence[Path]) -> Iterator[None]:
+    """Name the log in errors of what is computed of it; those of options that have nothing to do with it stay.
+
+    Args:
+        logs: Its files.
+    """
+    name, of_log = titled(logs), ("`n_levels`", "`model`", "`start`")
+    try:
+        yield
+    except RecordingError:  # has the name
+        raise
+    except ValueError as error:
+        message = str(error)
+        told = message.replace("`signal`", name).replace("`LOG`", name)
+        if told == message and (not message.startswith("`") or message.startswith(of_log)):
+            told = f"{name}: {message}"
+        raise ValueError(told) from error
 
 
 def at_rest(recording: Recording, resting: tuple[float, float] | None) -> Recording:
@@ -73,13 +94,6 @@ def without_gaps(recording: Recording, done: str, fewest: int, otherwise: str = 
     ]
 
 
-def unit_note(unit: str) -> list[str]:
-    """A sentence on a unit in which no datasheet can be given."""
-    if unit in (*KNOWN_UNITS, "unknown"):
-        return []
-    return [f"Unit {unit!r} is none of {', '.join(KNOWN_UNITS)}: numbers are in it as they stand."]
-
-
 def say_notes(recording: Recording) -> None:
     """Print what was found in a recording, where there is anything."""
     rows = [(note.kind.replace("_", " "), note.stream or "-", note.sentence) for note in recording.notes]
@@ -118,7 +132,13 @@ def model_grid(path: Path) -> tuple[float | None, str | None]:
         raise ValueError(f"{path}: expected 'rate' to be a number of Hz, got {str(rate)[:80]!r}")
     if unit is not None and not isinstance(unit, str):
         raise ValueError(f"{path}: expected 'unit' to be a text such as 'deg/s', got {str(unit)[:80]!r}")
-    return rate, (None if unit == "unknown" else unit)
+    if unit in (None, "unknown"):
+        return rate, None
+    if canonical_unit(unit) not in KNOWN_UNITS:
+        raise ValueError(
+            f"{path}: expected 'unit' to be one of {', '.join(KNOWN_UNITS)}, got {unit[:80]!r}; correct it there"
+        )
+    return rate, canonical_unit(unit)
 
 
 def as_the_model(recording: Recording, path: Path) -> Recording:
@@ -136,14 +156,23 @@ def on_grid(recording: Recording, path: Path, rate: float | None, unit: str | No
         unit: Its unit.
 
     Raises:
-        ValueError: Their rates differ.
+        ValueError: Their rates differ, or their units are of different quantities.
     """
+    source = ", ".join(recording.source) or "the recording"
     if rate is not None and not same_rate(rate, recording.rate):
         raise ValueError(
-            f"{path}: expected a model for the recording's {recording.rate:g} Hz, got one that was fitted at "
+            f"{path}: expected a model for the {recording.rate:g} Hz of {source}, got one that was fitted at "
             f"{rate:g} Hz; fit one at that rate, or resample the log"
         )
-    return recording if unit is None or recording.unit in ("unknown", unit) else recording.to(unit)
+    if unit is None or recording.unit in ("unknown", unit):
+        return recording
+    try:
+        return recording.to(unit)
+    except ValueError:
+        raise ValueError(
+            f"{path}: expected a model in {recording.unit}, the unit of {source}, or one that it can be converted to, "
+            f"got one in {unit}; give one that was fitted to the same quantity"
+        ) from None
 
 
 def agreed_rate(models: Sequence[Path], rate: float | None) -> float | None:
@@ -181,7 +210,7 @@ def agreed_unit(model: Path | None, unit: str | None) -> str | None:
         ValueError: The two differ.
     """
     own = None if model is None else model_grid(model)[1]
-    asked = None if unit is None else known_unit(unit)
+    asked = None if unit is None else known_unit("--unit", unit)
     if None not in (asked, own) and asked != own:
         raise ValueError(f"`--unit`: expected {own}, for which the model was fitted, got {asked}; see {model}")
     return asked or own

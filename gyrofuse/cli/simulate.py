@@ -57,7 +57,13 @@ def simulate(
     ] = None,
     writing: Writing,
 ) -> None:
-    """Simulate a recording from a noise model."""
+    """Simulate a recording from a noise model.
+
+    MODEL is a file in JSON, as fit --model-out writes it, or a formula of processes with their numbers, per sample and
+    in the unit of the signal: "WN(variance=1e-4) + AR1(phi=0.99, variance=1e-8) + 2*RW(variance=1e-10)". Processes are
+    WN(variance), QN(variance), FN(variance), AR1(phi, variance), GM2(phi, variance), RW(variance), DR(slope) and
+    SIN(amplitude, beta).
+    """
     check_positive_integer("--samples", samples)
     check_positive_integer("--sensors", 1 if sensors is None else sensors)
     source = [Path(model)] if model.lower().endswith(".json") else []

@@ -118,8 +118,12 @@ class _Triad:
         if isinstance(given, GMWMResult):
             rate, unit = (given.rate if rate is None else rate), (unit or given.unit)
         if rate is None or unit is None:
-            lacking = "rate" if rate is None else "unit"
-            raise ValueError(f"`{lacking}`: expected that of `{name}`, which does not say it, got none; give it")
+            lacking, such_as = ("rate", "rate=100.0") if rate is None else ("unit", 'unit="deg/s"')
+            of_log = ", or to `read_recording` for a log that states none" if isinstance(given, GMWMResult) else ""
+            raise ValueError(
+                f"`{lacking}`: expected that of `{name}`, which does not say it, got none; give it, such as {such_as}"
+                f"{of_log}"
+            )
         factor = units.unit_factor(unit, target)
         rate, unit = check_positive("rate", rate), units.canonical_unit(unit)
         if not isinstance(given, GMWMResult):

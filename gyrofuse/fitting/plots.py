@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 _COLOURS = ("#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 _STYLES = ("--", "-.", ":")
 _FADED = "#b8b8b8"
-# Difference of criteria up to which their axis is linear: beyond, candidates are out of question.
-_LINEAR = 10.0
+# Difference of criteria, half nats, at which its axis ends: candidates beyond are out of the question.
+_MOST_SHOWN = 40.0
 
 
 def plot_moment_fit(
@@ -161,6 +161,8 @@ def plot_ranking(
 ) -> Axes:
     """Draw the criteria of candidates over that of the chosen one.
 
+    The axis ends where candidates are out of the question; those beyond have an arrow and their number.
+
     Args:
         names: Names of the candidates, from the best on.
         difference: Criteria less that of the chosen one, `(candidate,)`.
@@ -176,29 +178,30 @@ def plot_ranking(
     """
     ax = ax if ax is not None else new_axes()
     values, aside = difference.tolist(), aside or []
-    least, most = min([0.0, *values]), max([_LINEAR, *values])
+    ends = [min(max(value, -_MOST_SHOWN), _MOST_SHOWN) for value in values]
+    least, most = min([0.0, *ends]), max([_MOST_SHOWN / 4, *ends])
     ax.axvline(0.0, color=INK, linewidth=0.8, zorder=1)
     for named, color in ((("chosen", ""), BLUE), (("equivalent",), _COLOURS[1]), (("redundant",), _FADED)):
         places = [k for k, own in enumerate(standings) if own in named]
         if places:
-            shown = [values[k] for k in places]
-            ax.hlines(places, 0.0, shown, color=color, linewidth=5, zorder=2)
-            ax.plot(shown, places, "o", color=color, markersize=8, zorder=3, label=named[-1] or "candidate")
+            ax.hlines(places, 0.0, [ends[k] for k in places], color=color, linewidth=5, zorder=2)
+            style: dict[str, Any] = {"linestyle": "none", "color": color, "markersize": 8, "zorder": 3}
+            ax.plot([], [], marker="o", label=named[-1] or "candidate", **style)
+            for k in places:
+                ax.plot(ends[k], k, marker="o" if ends[k] == values[k] else "<" if values[k] < 0 else ">", **style)
     chosen = "chosen, though the J test refuses it" if rejected else "chosen"
     for k, (value, standing) in enumerate(zip(values, standings, strict=True)):
         text = chosen if standing == "chosen" else f"{value:+.1f}"
-        ax.annotate(text, (max(value, 0.0), k), (9, 0), textcoords="offset points", va="center", fontsize=8)
+        ax.annotate(text, (max(ends[k], 0.0), k), (9, 0), textcoords="offset points", va="center", fontsize=8)
     for k in range(len(aside)):
         ax.annotate("not compared", (0.0, len(values) + k), (9, 0), textcoords="offset points", va="center", fontsize=8)
     ax.set_yticks(range(len(values) + len(aside)), [*names, *aside])
     ax.set_ylim(len(values) + len(aside) - 0.5, -0.5)
-    ax.set_xscale("symlog", linthresh=_LINEAR)
-    decades = [_LINEAR * 10.0**k for k in range(12)]
-    ticks = [-t for t in decades if t <= -least] + [0.0, _LINEAR / 2] + [t for t in decades if t <= 4 * most]
-    ax.set_xticks(sorted(ticks), [f"{t:.6g}" for t in sorted(ticks)])
-    ax.set_xticks([], minor=True)
-    ax.set_xlim(1.5 * least - 0.1 * _LINEAR, 4 * most)  # space for the numbers
-    ax.set_xlabel("criterion over that of the chosen model (half nats)")
+    room = 0.25 * (most - least)  # for the numbers
+    ax.set_xlim(least - 0.05 * (most - least), most + room)
+    ax.set_xticks([tick for tick in ax.get_xticks() if ax.get_xlim()[0] <= tick <= most])
+    beyond = "; arrow: beyond the axis" if ends != values else ""
+    ax.set_xlabel(f"criterion over that of the chosen model (half nats{beyond})")
     if title:
         ax.set_title(title, loc="left", fontsize=10, parse_math=False)
     if note:

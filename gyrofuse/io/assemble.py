@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from gyrofuse._base.checks import same_rate
-from gyrofuse._base.units import unit_factor
+from gyrofuse._base.units import KNOWN_UNITS, known_unit, unit_factor
 from gyrofuse.io.align import Placed, align
 from gyrofuse.io.clock import Grid, grid_of, regular_grid
 from gyrofuse.io.formats import read_streams
@@ -232,10 +232,19 @@ def _units(
     streams: Sequence[Stream], unit: str | None, scale: float | None, source: str
 ) -> tuple[str, list[float], list[Note]]:
     """The common unit, the factor that converts each device to it, and notes on assumptions."""
+    if unit is not None:
+        unit = known_unit("unit", unit)
     if scale is not None:
         name = unit or _UNKNOWN
         return name, [scale] * len(streams), [Note("unit", "", f"numbers of the log times {scale:g} are {name}")]
     stated = [stream.unit for stream in streams]
+    strange = next((stream for stream in streams if stream.unit not in (*KNOWN_UNITS, _UNKNOWN)), None)
+    if strange is not None:
+        raise RecordingError(
+            f"{source}: expected one of the units {', '.join(KNOWN_UNITS)}, found {strange.unit[:80]!r} "
+            f"in {strange.name}; give one with unit= (--unit), and with scale= (--scale) the factor that "
+            "brings the numbers of the log to it"
+        )
     target = unit or next((u for u in stated if u != _UNKNOWN), _UNKNOWN)
     factors, notes = [], []
     for stream in streams:

@@ -14,7 +14,7 @@ from torch import Tensor
 from gyrofuse._base.checks import check_n_samples, check_positive, check_positive_integer, largest_level
 from gyrofuse._base.deprecation import moved_names
 from gyrofuse._base.results import counted, numbered
-from gyrofuse._base.units import check_quantity
+from gyrofuse._base.units import check_quantity, known_unit
 from gyrofuse.io.formats.slices import open_slices
 from gyrofuse.io.quantities import QUANTITY
 
@@ -161,7 +161,7 @@ def open_recording(
         FileNotFoundError: No such file.
         RecordingError: The file cannot be read chunk by chunk: says what was expected, what was found, what to do.
         ValueError: A rate that is not positive, or no such quantity.
-        ImportError: A format whose library is not installed (`pip install "gyrofuse[logs]"`).
+        ImportError: A format whose library is not installed (the extra `logs`); the message names it.
     """
     check_quantity(quantity)
     found = open_slices(Path(path), key, QUANTITY[quantity])
@@ -170,7 +170,7 @@ def open_recording(
         n_sensors=len(found.sensors),
         n_samples=found.n_samples,
         rate=found.rate if rate is None else rate,
-        unit=unit or found.unit,
+        unit=found.unit if unit is None else known_unit("unit", unit),
         sensors=found.sensors,
         path=Path(path).resolve(),
     )

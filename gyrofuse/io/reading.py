@@ -18,6 +18,7 @@ from gyrofuse.io.formats.request import Request
 from gyrofuse.io.limits import is_rate
 from gyrofuse.io.quantities import QUANTITY
 from gyrofuse.io.recording import Recording
+from gyrofuse.io.streams import RecordingError
 
 
 def read_recording(
@@ -63,7 +64,7 @@ def read_recording(
         FileNotFoundError: No such file.
         RecordingError: The file cannot be read as a recording: says what was expected, what was found, what to do.
         ValueError: An option that does not fit the log, or a file that is named twice.
-        ImportError: A format whose library is not installed (`pip install "gyrofuse[logs]"`).
+        ImportError: A format whose library is not installed (the extra `logs`); the message names it.
     """
     paths = [Path(path)] if isinstance(path, str | Path) else [Path(p) for p in path]
     if not paths:
@@ -88,7 +89,12 @@ def read_recording(
         notes=whole.notes,
         quantity=quantity_of(whole.unit) or quantity,
     )
-    return recording if sensors is None else recording.select(sensors=sensors)
+    if sensors is None:
+        return recording
+    try:
+        return recording.select(sensors=sensors)
+    except ValueError as error:
+        raise RecordingError(f"{', '.join(map(str, paths))}: {error}") from None
 
 
 def check_reading(

@@ -41,6 +41,20 @@ def reading(path: object, expected: str, remedy: str) -> Iterator[None]:
         ) from error
 
 
+def not_installed(path: object, doing: str, library: str) -> ImportError:
+    """The error for an optional library that is not installed.
+
+    Args:
+        path: The file that needs it.
+        doing: What with, such as `"reading ULog"`.
+        library: Name of the library.
+    """
+    return ImportError(
+        f"{path}: {doing} needs {library}; pip install {library}, or all readers of logs with "
+        f'pip install ".[logs]" where the sources of gyrofuse are'
+    )
+
+
 @contextmanager
 def needed(path: object, what: str, library: str) -> Iterator[None]:
     """Name the log in the error of a library that is imported in the body and not installed.
@@ -53,7 +67,7 @@ def needed(path: object, what: str, library: str) -> Iterator[None]:
     try:
         yield
     except ImportError as error:
-        raise ImportError(f'{path}: reading {what} needs {library}; pip install "gyrofuse[logs]"') from error
+        raise not_installed(path, f"reading {what}", library) from error
 
 
 def unexpected(source: object, error: Exception) -> RecordingError:

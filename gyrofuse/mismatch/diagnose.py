@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from numbers import Real
@@ -17,7 +18,7 @@ from gyrofuse.mismatch.detectors.spectra.fit_verdict import KNOWN, fit_verdict
 from gyrofuse.mismatch.detectors.tests import TESTS, family_wise_p_value, run_tests
 from gyrofuse.mismatch.detectors.variance.rest import rest_words
 from gyrofuse.mismatch.mechanisms.mechanism import Context, repaired
-from gyrofuse.mismatch.repair.inputs import Simulation, modelled, on_processor, prepared
+from gyrofuse.mismatch.repair.inputs import Simulation, modelled, on_processor, prepared, same_data_words
 from gyrofuse.mismatch.repair.noise_model import noise_of, noise_samples
 from gyrofuse.mismatch.repair.reference_effects import with_own_effects
 from gyrofuse.mismatch.repair.repaired_model import RepairedModel
@@ -95,6 +96,8 @@ def diagnose(
     given = prepared(recording, simulation, rate, generator)
     if judge is not None:
         judge = checked_judge(judge, recording, rate)
+    if twice := same_data_words(given, judge):
+        warnings.warn(twice, stacklevel=2)
     start, own = with_own_effects(given, simulation, level, generator)
     model = RepairedModel(noise_of(simulation, _unrounded(start)), start.info, own, noise_samples(simulation))
     before = run_tests(start, lambda what, share: progress(what, _TESTED * share))
@@ -117,7 +120,7 @@ def diagnose(
             comparison=start,
             model=made or model,
             judged=verdict,
-            notes=tuple(note for note in (rest_words(given), words) if note),
+            notes=tuple(note for note in (twice, rest_words(given), words) if note),
             **found,
         )
 

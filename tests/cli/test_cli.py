@@ -17,6 +17,7 @@ from pages import Page
 import gyrofuse as gf
 from gyrofuse.cli import app as cli
 from gyrofuse.cli import fuse
+from gyrofuse.cli.simulate import save_recording
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -308,8 +309,33 @@ def test_a_stretch_beyond_the_log_and_a_strange_unit_are_told(run: Run, log: Pat
     assert "`--rest`" not in run("fit", log, "--model", "WN", "--rest", "0:15").err
     signal = gf.read_recording(log).signal
     gf.Recording(signal, rate=50.0, unit="furlong").save(tmp_path / "strange.npz")
-    assert "Unit 'furlong' is none of deg/s" in run("fit", "strange.npz", "--model", "WN").out
-    assert "is none of" not in run("fit", log, "--model", "WN").out
+    fit = ("fit", "strange.npz", "--model", "WN")
+    refused(run(*fit), "strange.npz: expected one of the units deg/s")
+    refused(run(*fit), "found 'furlong' in 1; give one with unit= (--unit)")
+    assert run(*fit, "--unit", "deg/s", "--scale", 1).status == 0
+    refused(run(*fit, "--unit", "furlong"), "`--unit`: expected one of deg/s")
+    rows = "".join(f"{k / 100},{k % 3}\n" for k in range(99))
+    (tmp_path / "strange.csv").write_text(f"time,gyro_x [bananas]\n{rows}")
+    refused(run("info", "strange.csv"), "found 'bananas'")
+    (tmp_path / "m.json").write_text(json.dumps({**gf.WhiteNoise(1.0).to_dict(), "rate": 50.0, "unit": "furlong"}))
+    simulate = ("simulate", "m.json", "--samples", 9, "--out", "o.npz")
+    refused(run(*simulate), "m.json: expected 'unit' to be one of deg/s")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("fuse", "tiny.npz"), "tiny.npz: expected at least as many complete windows as sensors (3)"),
+        (("fit", "tiny.npz", "--model", "WN + 3*AR1"), "tiny.npz: `model`: expected at most as many parameters"),
+        (("rank", "tiny.npz"), "tiny.npz: expected at least 32 samples, got 3"),
+        (("fuse", "log.npz", "--sensors", "q"), "log.npz: `sensors`: expected some of 'a', 'b', 'c', got 'q'"),
+        (("fuse", "log.npz", "--levels", 99), "log.npz: `n_levels`: expected at most"),
+        (("rank", "log.npz", "--rest", "1e8:1e9"), "log.npz: `start`, `stop`: expected a stretch within 0 to"),
+    ],
+)
+def test_errors_name_the_log(run: Run, log: Path, tmp_path: Path, arguments: tuple[object, ...], says: str):
+    gf.Recording(gf.read_recording(log).signal[:, :3], rate=50.0, unit="deg/s").save(tmp_path / "tiny.npz")
+    refused(run(*arguments), says)
 
 
 def test_kalibr_has_a_longest_correlation_time_of_white_noise(run: Run, log: Path):
@@ -652,15 +678,15 @@ def test_an_absurd_number_of_levels_is_refused(run: Run, log: Path):
     refused(run("fuse", log, "--levels", "1" + "0" * 30), "`n_levels`: expected at most")
 
 
-def test_names_that_came_with_a_log_stay_cells_of_one_line(run: Run, tmp_path: Path):
+def test_names_that_came_with_a_log_stay_cells_of_one_line(tmp_path: Path):
     """A unit or name with a comma, a line end or a formula: the file can be read back, and no cell is a formula."""
     unit = "x]\n=cmd|' /C calc'!A0,1"
-    gf.Recording(noise(3, 400), rate=100.0, unit=unit, sensors=("=a", "b,c", "d")).save(tmp_path / "log.npz")
-    assert run("fuse", "log.npz", "--out", "o.csv", "--covariance", "none").status == 0
+    recording = gf.Recording(noise(3, 400), rate=100.0, unit=unit, sensors=("=a", "b,c", "d"))
+    save_recording(recording, tmp_path / "o.csv")
     lines = (tmp_path / "o.csv").read_text().splitlines()
     assert len(lines) == 401
     assert not any(line.startswith(("=", "+", "-", "@")) for line in lines)
-    assert gf.read_recording(tmp_path / "o.csv").n_samples == 400
+    assert gf.read_recording(tmp_path / "o.csv", unit="deg/s", scale=1.0).n_samples == 400
 
 
 def test_a_page_of_a_file_whose_name_is_no_text(run: Run, tmp_path: Path):

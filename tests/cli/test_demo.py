@@ -75,6 +75,17 @@ def test_story_and_files(ran: tuple[Path, str]):
     assert f"the intervals hold {held} of 6" in " ".join(story.split())
     report = (folder / "report.html").read_text()
     assert "The array is simulated" in report
+    least = f"Allan deviation up to {100 * (1 - gain.min().item()):.0f} % lower than that of their mean"
+    assert least in report
+    mismatch = json.loads((folder / "mismatch.json").read_text())
+    short = " ".join(story[story.index("In short:") :].split())
+    assert least in short
+    names = [finding["mechanism"].replace("_", " ") for finding in mismatch["findings"]]
+    if names:
+        assert f"Found: {', '.join(names)}. " in short
+        assert f"{mismatch['held_out']['before']:.3g} -> {mismatch['held_out']['after']:.3g}" in short
+    else:
+        assert "Nothing found" in short or "could not be named" in short
     models = json.loads((folder / "models.json").read_text())
     rows = re.findall(r"^ *(\d|virtual)  (WN[^ ]*(?: \+ [^ ]+)*) +([-\d.].*)$", story, re.MULTILINE)
     assert [row[0] for row in rows] == [*"123456", "virtual"]

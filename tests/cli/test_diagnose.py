@@ -84,7 +84,7 @@ def test_a_model_says_for_which_rate_and_unit_it_is(run: Run, log: Path):
     Path("faster.json").write_text(json.dumps(fitted | {"rate": 2 * RATE}))
     refused = run("diagnose", log, "--simulation", "faster.json", "--json", "r.json")
     assert refused.status == 2
-    assert "faster.json: expected a model for the recording's 50 Hz, got one that was fitted at 100 Hz" in refused.err
+    assert "faster.json: expected a model for the 50 Hz of log.npz, got one that was fitted at 100 Hz" in refused.err
     assert not Path("r.json").exists()
 
 
@@ -109,7 +109,8 @@ def test_one_axis_of_several(run: Run, log: Path):
     refused = run("diagnose", "axes.npz", "--simulation", "sim.npz")
     assert (refused.status, refused.out) == (2, "")
     assert "axes.npz: expected the sensors of one axis, got axes x, y; choose one with --axis" in refused.err
-    assert run("diagnose", "axes.npz", "--simulation", "axes.npz", "--axis", "y").status == 0
+    gf.Recording(axes.flip(0), rate=RATE, unit="deg/s", axes=("x", "y")).save("other.npz")
+    assert run("diagnose", "axes.npz", "--simulation", "other.npz", "--axis", "y").status == 0
 
 
 def test_samples_that_are_missing_leave_the_longest_stretch(run: Run, log: Path):

@@ -34,7 +34,9 @@ def test_two_models_are_compared(run: Run, models: Path):
     assert len(told["time"]) == len(told["ratio"]) == len(told["low"])
     assert told["peak"]["low"] <= told["peak"]["ratio"] <= told["peak"]["high"]
     assert Path("e.png").stat().st_size > 5000
-    again = run(*asked, "--json", "f.json")
+    formulas = [f"AR1(phi=0.18,variance=0.03) + RW(variance={q})" for q in (1e-6, 1e-9)]
+    written = ("--model", formulas[0], "--against", formulas[1], "--rate", 10, "--unit", "deg/s")
+    again = run("emulate", *written, *asked[5:], "--json", "f.json")
     assert again.status == 0
     assert json.loads(Path("f.json").read_text())["ratio"] == told["ratio"]
 
@@ -51,6 +53,9 @@ def test_accelerometers_are_in_their_unit(run: Run, models: Path):
     ("arguments", "says"),
     [
         (("--model", "a.json", "--against", "gone.json"), "gone.json"),
+        (("--model", "WN + RW", "--against", "b.json"), "`--model`: expected a file in JSON, or a formula"),
+        (("--model", "a.json", "--against", "WN + RW(variance=1)"), "`--against`: `white_noise.variance`: expected a"),
+        (("--model", "WM(variance=1)", "--against", "b.json"), "did you mean WN?"),
         (("--model", "a.json", "--against", "b.json", "--rate", "100"), "Hz, for which the model was fitted, got 100"),
         (("--model", "a.json", "--against", "b.json", "--unit", "rad/s"), "`--unit`: expected deg/s"),
         (("--model", "a.json", "--against", "b.json", "--flights", "0"), "`--flights`"),

@@ -101,7 +101,7 @@ def test_samples_that_are_missing_leave_the_longest_stretch(run: Run, log: Path)
     recording.save(log, force=True)
     refused = run("rank", log)
     assert (refused.status, refused.out) == (2, "")
-    assert "`LOG`: expected a stretch of at least 32 samples that no sensor lacks, got one of 19" in refused.err
+    assert "log.npz: expected a stretch of at least 32 samples that no sensor lacks, got one of 19" in refused.err
 
 
 def test_a_report_is_replaced_with_force_only(run: Run, log: Path):

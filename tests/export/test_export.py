@@ -412,6 +412,10 @@ def test_kalibr_of_the_other_quantity_is_refused():
     accelerometers = fits_of_three_axes("m/s^2", 1.0, 0.1)
     with pytest.raises(ValueError, match=r"`unit`: expected one of deg/s.*got 'm/s\^2'"):
         to_kalibr(accelerometers)
+    unknown = fit_gmwm(Recording(WhiteNoise(1.0).simulate(500, batch=(1,)), rate=100.0), "WN")
+    says = '`unit`: expected that of `model`, .* such as unit="deg/s", or to `read_recording` for a log that'
+    with pytest.raises(ValueError, match=says):
+        to_kalibr(unknown)
     with pytest.raises(ValueError, match="`rate`: expected that of `model`, which does not say it"):
         to_kalibr(WhiteNoise(1.0))
 

@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
+from gyrofuse._base.axes import finish
 from gyrofuse.fusion import plots as plotting
 
 TAU = 0.1 * 2.0 ** np.arange(8)
@@ -295,3 +296,23 @@ def test_new_axes_belong_to_pyplot_so_that_they_can_be_shown():
     assert plt.fignum_exists(ax.figure.number)
     plt.close(ax.figure)
     assert plt.get_fignums() == before
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "told"),
+    [
+        (1e-6, 1e-2, ["1e-6", "1e-5", "1e-4", "0.001", "0.01"]),
+        (4e-6, 8e-5, ["5e-6", "1e-5", "2e-5", "5e-5"]),
+        (0.4, 60.0, ["0.5", "1", "2", "5", "10", "20", "50"]),
+        (0.92, 1.38, ["1", "1.1", "1.2", "1.3"]),
+    ],
+)
+def test_logarithmic_axes_have_plain_numbers(low: float, high: float, told: list[str]):
+    ax = Figure().subplots()
+    ax.plot([low, high], [low, high])
+    ax.set_yscale("log")
+    ax.set_ylim(low, high)
+    finish(ax)
+    shown = [tick for tick in ax.get_yticks() if low <= tick <= high]
+    assert [ax.yaxis.get_major_formatter()(tick) for tick in shown] == told
+    assert not any(label.get_text() for label in ax.yaxis.get_ticklabels(minor=True))

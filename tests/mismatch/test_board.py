@@ -175,7 +175,9 @@ def test_from_the_command_line(tmp_path: Path, run: Run):
     told = json.loads(Path("found.json").read_text())
     assert "step" in [cause["mechanism"] for cause in told["causes"]]
     assert set(told["groups"]) == {"rate", "acceleration"}
-    assert "Step" in Page(Path("page.html").read_text()).text
+    page = Page(Path("page.html").read_text())
+    assert "Step, in " in page.text[: page.text.index("1. ")]
+    assert "#cause-1" in page.links
     again = run(*given, "board.json", "--json", "again.json")
     assert (again.status, again.err) == (0, "")
     for arguments, says in (

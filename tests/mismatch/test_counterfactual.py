@@ -292,11 +292,12 @@ def test_reports_tell_what_was_ruled_out(tmp_path):
     report = diagnose(recording, gf.Recording(comparison.reference.signal[0], rate=RATE, unit="deg/s"))
     (finding,) = report.findings
     words = otherwise_words(finding)
-    assert words.startswith("instead of vibration tone: resonance would gain")
+    assert words.startswith("closest look-alike of vibration tone: resonance, which in its place predicts held-out ")
+    assert words.endswith("it is ruled out")
     assert words in report.summary()
     report.to_html(tmp_path / "page.html")
     page = (tmp_path / "page.html").read_text()
-    assert "Instead of vibration tone: resonance would gain" in page
+    assert "Closest look-alike of vibration tone: resonance" in page
     assert "lost if left out alone" in page
     entry = report.to_dict()["findings"][0]["instead"]
     assert {"mechanism", "gain", "sd"} == entry.keys()
@@ -315,11 +316,13 @@ def test_equals_are_told_as_such():
         instead=Alternative("warm_up_transient", 11.0, 2.0),
     )
     assert otherwise_words(finding) == (
-        "instead of step: warm up transient cannot be told from it, and would gain 1.0 nats less "
-        "(held out, standard deviation 2.0)"
+        "closest look-alike of step: warm up transient, which in its place predicts held-out data worse by 1.0 nats "
+        "(standard deviation 2.0): these data do not tell which of the two it is"
     )
     likelier = replace(finding, instead=Alternative("warm_up_transient", 17.0, 2.0))
-    assert "warm up transient is likelier, and would gain 5.0 nats more" in otherwise_words(likelier)
+    assert "better by 5.0 nats (standard deviation 2.0): the name given here is in doubt" in otherwise_words(likelier)
+    nothing = replace(finding, alternatives=(), instead=Alternative("warm_up_transient", -3.0, 2.0))
+    assert otherwise_words(nothing).endswith("which in its place explains nothing of the held-out data")
     assert otherwise_words(replace(finding, instead=None)) == ""
 
 

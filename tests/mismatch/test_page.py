@@ -22,7 +22,8 @@ from gyrofuse.mismatch.repair.inputs import prepared
 from gyrofuse.mismatch.reporting import text as telling
 from gyrofuse.mismatch.reporting.figures_data import compared_powers, compared_variances, grouped_spectrum
 from gyrofuse.mismatch.reporting.page import mismatch_page
-from gyrofuse.mismatch.reporting.plots import ends_of_colours, plot_map
+from gyrofuse.mismatch.reporting.plots import ends_of_colours, plot_map, plot_shares
+from gyrofuse.mismatch.selection.shares import Share
 from gyrofuse.mismatch.signals.comparison import Comparison
 
 pytestmark = pytest.mark.usefixtures("blank_images")
@@ -71,6 +72,9 @@ def test_the_page_begins_with_the_verdict():
     found = told.text.index(telling.capital(report().findings[0].sentence))
     assert told.text.index("A title") < verdict < told.text.index("Recording and simulation differ: p = ") < found
     assert "Said <i>besides</i>." in told.text
+    h = report().held_out
+    assert f"Found: vibration tone. Held-out data become likelier by {telling.nats(h.gain)} nats (spectra)" in told.text
+    assert f"discrepancy {h.before:.3g} → {h.after:.3g} (1 = noise alone)." in told.text
     assert told.tags.count("img") == 5  # one of its finding
     assert "script" not in told.tags
     assert "b" not in told.tags
@@ -92,16 +96,45 @@ def test_the_page_has_every_parameter_with_limits_and_unit():
         assert low < high  # enough digits
 
 
+def test_the_amplitude_of_the_sentence_is_that_of_the_table():
+    """Noise adds to the squares of amplitudes, and only the table's was without that."""
+    finding = gf.diagnose(gf.Recording(drawn(N, 1) + 0.4 * tone(), rate=RATE, unit="deg/s"), NOISE).findings[0]
+    sizes = {name: entry.value for name, entry in finding.parameters.items() if name.startswith("amplitude")}
+    name = max(sizes, key=sizes.__getitem__)
+    assert f"of amplitude up to {sizes[name]:.3g} deg/s (sensor {int(name[-2]) + 1})" in finding.sentence
+    assert f"{float(finding.effect.amplitude[int(name[-2])]):.3g}" not in finding.sentence
+
+
 def test_the_page_names_every_witness_and_what_was_ruled_out():
     told = page(report())
     for before, after in zip(report().evidence, report().evidence_after, strict=True):
         row = next(row for row in told.rows if row[0] == before.test.replace("_", " "))
         assert float(row[1]) == pytest.approx(before.p_value, rel=0.06)
-        assert float(row[2]) == pytest.approx(after.p_value, rel=0.06)
-        assert telling.capital(before.words) in row[3]
+        assert row[2] == telling.chance_words(before.p_value)
+        assert float(row[3]) == pytest.approx(after.p_value, rel=0.06)
+        if before.p_value < 1e-6:
+            assert row[4] == f"{telling.capital(before.words)}."
+        elif before.p_value > 0.01 and before.sensors:
+            assert row[4] == f"Nothing beyond chance; most extreme: {before.words}."
+        else:
+            assert before.words[1:] in row[4]
     assert "Looked for and not found" in told.text
     assert "After the repair no test sees a difference." in told.text
     assert "Unexplained" not in told.text
+
+
+@pytest.mark.parametrize(
+    ("p_value", "told"),
+    [
+        (1.0, "10 of 10"),
+        (0.34, "3 of 10"),
+        (0.004, "1 of 250"),
+        (3.3e-6, "1 of 300 000"),
+        (0.0, "less than 1 of a million"),
+    ],
+)
+def test_a_p_value_is_said_as_a_count(p_value: float, told: str):
+    assert telling.chance_words(p_value) == told
 
 
 def test_what_is_left_and_what_cannot_be_told_apart_is_said():
@@ -138,6 +171,7 @@ def test_what_stays_is_said_once() -> None:
 def test_agreement_is_told_as_such():
     told = page(report(False))
     assert "Recording and simulation agree" in told.text
+    assert "Nothing found: recording and simulation agree (p = " in told.text
     assert "differ: p" not in told.text
     assert "Vibration tone" not in told.text
     assert "After the repair" not in told.text
@@ -146,6 +180,17 @@ def test_agreement_is_told_as_such():
     assert note.startswith("The model's numbers are taken as known exactly")
     assert note in told.text
     assert str(report(False)) == f"Recording and simulation agree (p = {report(False).p_value:.2g}).\n{note}"
+
+
+def test_the_same_data_on_both_sides_are_told():
+    recording = observed(False)
+    with pytest.warns(UserWarning, match="Recording and simulation are the same data, sample by sample"):
+        same = gf.diagnose(recording, recording)
+    assert same.notes[0].endswith("Give another simulation.")
+    assert same.notes[0] in str(same)
+    assert same.notes[0] in page(same).text
+    with pytest.warns(UserWarning, match="Recording and judge are the same data"):
+        gf.diagnose(recording, NOISE, judge=recording)
 
 
 def test_a_difference_without_a_name_is_told_as_such():
@@ -161,6 +206,15 @@ def test_no_line_breaks_within_an_arrow():
     told = page(dataclasses.replace(report(), findings=(finding,))).text
     assert told.count("White noise 1 → 2 deg/s.") == 2
     assert "->" not in told
+
+
+def test_words_are_explained_at_the_foot_of_the_page():
+    told = page(report())
+    assert "details" in told.tags
+    foot = told.text[told.text.index("What the words on this page mean") :]
+    for word in ("p value", "held out", "nats", "discrepancy", "area under the curve", "look-alike", "repair"):
+        assert word in foot
+    assert report().summary().endswith("explained at the foot of the page (to_html, --report).")
 
 
 def test_to_html_writes_the_page(tmp_path: Path):
@@ -191,6 +245,30 @@ def test_map_marks_what_chance_does_not_give_and_greys_what_is_unknown():
     assert ax.collections[0].norm.vmax == 7.0
     assert ends_of_colours(torch.tensor([0.5]), torch.tensor([100.0])) == 12.0
     assert ends_of_colours(torch.tensor([torch.nan])) == ends_of_colours(torch.tensor([0.5])) == 4.0
+
+
+def test_shares_are_bars_from_zero_that_add_up():
+    """And what is below 0, or left below 0, is said to be so, and why."""
+    from matplotlib.figure import Figure
+
+    shares = (Share("quantization", True, 9.0, -1 / 7), Share("vibration_tone", True, 0.5, 8.5 / 7))
+    ax = plot_shares(8.0, shares, ax=Figure().subplots())
+    bars = [bar.get_width() for bar in ax.patches]
+    assert bars == pytest.approx([-100 / 7, 850 / 7, -50 / 7])
+    assert all(bar.get_x() == 0 for bar in ax.patches)
+    assert [text.get_text() for text in ax.texts] == ["-14.3 %   (8 → 9)", "121 %   (9 → 0.5)", "-7.14 %   (0.5)"]
+    held_out = report().held_out._replace(before=8.0, after=0.5, shares=shares)
+    told = dataclasses.replace(report(), held_out=held_out)
+    assert telling.share_words(told) == [
+        "Of the discrepancy above noise alone, 7 on data held out, mechanisms with names carry 107 %; nothing is left: "
+        "it is closer than noise alone is on average"
+    ]
+    assert "A share is below 0 where" in page(told).text
+    assert "A share is below 0 where" not in page(report()).text
+    curve = shares[0]._replace(identified=False)
+    (words,) = telling.share_words(dataclasses.replace(told, held_out=held_out._replace(shares=(curve, shares[1]))))
+    assert "curves without a name -14.3 %; nothing is left" in words
+    assert "below 0 %: these repairs by themselves take the simulation further away" in words
 
 
 def test_wavelet_variances_are_those_of_both_sides():

@@ -72,6 +72,26 @@ def test_the_picture_of_a_tone_has_its_line_before_the_repair_alone() -> None:
     assert after[1][:, 1].max() < observed[:, 1].max() / 5
 
 
+def test_the_picture_of_coherence_names_the_pair_and_has_the_reach_of_chance() -> None:
+    _, start = found(Step)
+    p = start.n_sensors
+    ax = Figure().subplots()
+    pictures.coherence(ax, start, 0, torch.tensor([9.0] + [0.1] * (p - 2) + [-0.5]))
+    name = start.info.sensors[-1]
+    assert ax.get_ylabel() == f"coherence of {start.info.sensors[0]} and {name}"
+    assert name in ax.get_legend().get_texts()[0].get_text()
+    own, _, limit = drawn_lines(ax)
+    np.testing.assert_allclose(own[:, 1], start.observed.coherence[:, 0, -1].abs())
+    rng, n_pictures = np.random.default_rng(0), 500
+    above = np.zeros(n_pictures, dtype=bool)
+    dof = start.observed.coherence_dof
+    for d, most in zip(dof[dof > 1].tolist(), limit[:, 1], strict=True):
+        # The power of one sensor that goes with another one's is one ordinate of d.
+        shared = rng.beta(1, d - 1, n_pictures)
+        above |= shared > most**2
+    assert above.sum() == pytest.approx(0.05 * n_pictures, abs=4 * (0.05 * n_pictures) ** 0.5)
+
+
 def test_other_findings_are_repaired_in_both_pictures() -> None:
     recording, simulation, drawn = concealed(Step, "picture")
     start = compared(recording, simulation)

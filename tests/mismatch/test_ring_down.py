@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 from bounds import at_most
+from matplotlib.figure import Figure
 from mismatch_draws import normal
 from scipy import signal
 from torch import Tensor
@@ -88,6 +89,21 @@ def test_a_line_that_wanders_and_comes_and_goes_is_no_knock_and_hides_none():
         assert found.p_value < 1e-6
         assert any(abs(cell.onset - 20000) < 100 and abs(cell.frequency - 0.09) < 0.005 for cell in found.cells[:8])
     assert alarms <= 3  # where the strong ones of eight spells all come at once, by chance
+
+
+def test_the_picture_shows_the_knock_of_the_sentence():
+    """Even where another one, which the other sensors do not have, is larger in the same sensor."""
+    both = of_nats(struck(1500.3, 0.15, 60.0), 200.0)
+    both[0] += 1.15 * both[0].abs().max() * struck(5000.8, 0.3, 60.0)
+    comparison = compared(both, 2)
+    found = RingDown.detect_and_fit(comparison, 1e-3)
+    assert found is not None
+    assert found.time_s == pytest.approx(1500 / RATE, abs=0.05)
+    assert found.effect.amplitude[:, 0].argmax() == 1
+    ax = Figure().subplots()
+    found.effect.plot(comparison, ax, sensor=0, fitted=True)
+    shown = ax.lines[0].get_xdata()
+    assert shown[0] < found.time_s < shown[-1] < 5000 / RATE
 
 
 @pytest.mark.parametrize(("frequency", "tau"), [(0.04, 60.0), (0.15, 25.0), (0.33, 120.0), (0.42, 12.0)])

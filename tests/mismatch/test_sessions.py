@@ -131,6 +131,12 @@ def test_the_page_says_whose_each_cause_is(tmp_path: Path):
     page = Page((tmp_path / "sessions.html").read_text(encoding="utf-8"))
     for words in ("Quantization: the device's", "Vibration tone: the session's", "Step: of one recording", "A & B."):
         assert words in page.text
+    verdict = page.text[: page.text.index("1. Quantization")]
+    assert f"Quantization, the device's, {report().cause_sentence(report().causes[0])}." in verdict
+    n_causes = len(report().causes)
+    assert [link for link in page.links if link.startswith("#")] == [f"#cause-{k + 1}" for k in range(n_causes)]
+    html = (tmp_path / "sessions.html").read_text(encoding="utf-8")
+    assert html.count('<section id="cause-') == n_causes
 
 
 @pytest.mark.usefixtures("blank_images")

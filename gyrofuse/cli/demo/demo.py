@@ -25,6 +25,7 @@ from gyrofuse.fusion.result import SVOResult
 from gyrofuse.fusion.svo import fit_svo
 from gyrofuse.fusion.weights.svo import svo_weights
 from gyrofuse.io.recording import Recording
+from gyrofuse.mismatch.reporting.text import found_words, headline
 from gyrofuse.noise.array_model import ArrayModel
 from gyrofuse.noise.parsing import model_from_dict
 
@@ -87,7 +88,7 @@ def run_demo(folder: Path, n_samples: int = N_SAMPLES) -> str:
     long, short = (fit_svo(recording, scale_weights) for scale_weights in ("long", "short"))
     truth = array.wavelet_cross_covariance(long.n_levels)
     remarks = _remarks(long, truth)
-    title = "Six simulated gyros, fused for long averaging times"
+    title = f"Six simulated gyros, fused for long averaging times: {_at_best(long, truth)}"
     virtual = long.virtual(recording)
     report = fusion_report(long, recording, virtual, title=title, remarks=remarks)
     together = Recording(
@@ -98,7 +99,8 @@ def run_demo(folder: Path, n_samples: int = N_SAMPLES) -> str:
     pages = {"report.html": report, "models.html": rank_report(models, together, title=title)}
     other = concealed(array, n_samples, RATE, UNIT, generator)
     mismatch = diagnose(other, array)
-    mismatch.to_html(folder / "mismatch.html", title="A recording of six gyros, and a simulation that lacks something")
+    title = f"What a simulation of six gyros lacks: {found_words(mismatch)}"
+    mismatch.to_html(folder / "mismatch.html", title=title)
     for name, page in pages.items():
         (folder / name).write_text(page, encoding="utf-8")
     for name, result in (("result.json", long), ("models.json", models), ("mismatch.json", mismatch)):
@@ -113,13 +115,33 @@ def run_demo(folder: Path, n_samples: int = N_SAMPLES) -> str:
     }
     for name, figure in drawn.items():
         save_figure(figure, figures / f"{name}.png", "png")
-    stories = (_story(long, short, truth, remarks), models_story(models, truths), mismatch_story(other, mismatch))
+    stories = (
+        _story(long, short, truth, remarks),
+        models_story(models, truths),
+        mismatch_story(other, mismatch),
+        "\n".join(
+            fill(words, 110, subsequent_indent="  ")
+            for words in (
+                "In short:",
+                f"- Fused, the six gyros have an {_at_best(long, truth)}.",
+                f"- Of the simulation that lacks something: {headline(mismatch)}",
+            )
+        ),
+    )
     return "\n\n".join(stories)
 
 
 def _gain(weights: Tensor, wccv: Tensor) -> Tensor:
     """Allan deviation with these weights over that of the plain mean, per level."""
     return (torch.einsum("i,jik,k->j", weights, wccv, weights) / wccv.mean((-1, -2))).sqrt()
+
+
+def _at_best(long: SVOResult, truth: Tensor) -> str:
+    """Where the fitted weights gain most, by the true noise: they are best of all weights in one sum of levels."""
+    ratio = _gain(long.weights, truth)
+    level, less = int(ratio.argmin()), 100 * (1 - float(ratio.min()))
+    where = f"at {number(long.tau[level].item())} s"
+    return f"Allan deviation up to {less:.0f} % lower than that of their mean, {where}"
 
 
 def _remarks(long: SVOResult, truth: Tensor) -> list[str]:

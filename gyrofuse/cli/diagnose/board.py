@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from gyrofuse._base.units import quantity_of
 from gyrofuse.cli.console import progress, progress_bar, say
 from gyrofuse.cli.options import Quantity, Reading, Writing
-from gyrofuse.cli.reading import at_rest, json_object, model_grid, on_grid, read_model, titled, without_gaps
+from gyrofuse.cli.reading import at_rest, json_object, model_grid, naming, on_grid, read_model, titled, without_gaps
 from gyrofuse.io.recording import Recording
 
 _GROUPS = (Quantity.rate, Quantity.acceleration)
@@ -104,18 +104,19 @@ def diagnose_whole_board(
         simulations = board.simulated()
         judges = None if board.judge is None else board.recordings([board.judge])
         remarks = list[str]()
-        for name, recording in recordings.items():
-            recordings[name], said = without_gaps(
-                _like(simulations[name], at_rest(recording, board.resting)), f"{name}: diagnosed", FEWEST
-            )
-            remarks += said
-            if judges is not None:
-                judges[name], said = without_gaps(_like(simulations[name], judges[name]), f"{name}: judged", 0)
+        with naming(board.logs):
+            for name, recording in recordings.items():
+                recordings[name], said = without_gaps(
+                    _like(simulations[name], at_rest(recording, board.resting)), f"{name}: diagnosed", FEWEST
+                )
                 remarks += said
-            if isinstance(simulations[name], Recording):
-                simulations[name], said = without_gaps(simulations[name], f"{name}: simulation compared", 0)
-                remarks += said
-        with progress_bar("comparing") as show:
+                if judges is not None:
+                    judges[name], said = without_gaps(_like(simulations[name], judges[name]), f"{name}: judged", 0)
+                    remarks += said
+                if isinstance(simulations[name], Recording):
+                    simulations[name], said = without_gaps(simulations[name], f"{name}: simulation compared", 0)
+                    remarks += said
+        with progress_bar("comparing") as show, naming(board.logs):
             found = diagnose_board(
                 recordings,
                 {name: one.model if isinstance(one, _OfFile) else one for name, one in simulations.items()},

@@ -14,7 +14,7 @@ from gyrofuse.cli.console import progress, say
 from gyrofuse.cli.diagnose.board import BoardInputs, check_of_board, diagnose_whole_board
 from gyrofuse.cli.diagnose.search import Search
 from gyrofuse.cli.options import Quantity, Reading, Rest, Writing, stretch, takes_options
-from gyrofuse.cli.reading import as_the_model, at_rest, read_model, say_notes, titled, without_gaps
+from gyrofuse.cli.reading import as_the_model, at_rest, naming, read_model, say_notes, titled, without_gaps
 from gyrofuse.io.recording import Recording
 from gyrofuse.noise.array_model import ArrayModel
 from gyrofuse.noise.processes import Model
@@ -113,7 +113,10 @@ def diagnose(
         names = [titled(group) for group in groups]
         if len({*names}) < len(names):  # in different folders
             names = [str(log) for log in logs]
-        parts = {name: at_rest(one, resting) for name, one in zip(names, recordings, strict=True)}
+        parts = {}
+        for name, group, one in zip(names, groups, recordings, strict=True):
+            with naming(group):
+                parts[name] = at_rest(one, resting)
         search = Search(simulated, judging, str(simulation), judge.name if judge else "", false_alarm, fitted_samples)
         found: MismatchReport | SessionsReport
         if several:

@@ -58,7 +58,7 @@ class Search:
         from gyrofuse.mismatch import diagnose_sessions
         from gyrofuse.mismatch.repair.inputs import FEWEST
 
-        with progress_bar("comparing") as show, self._named({"`recordings`": "LOG"}):
+        with progress_bar("comparing") as show, self._named({"`recordings`": ", ".join(recordings)}):
             options, remarks = self._options()
             parts = []
             for name, recording in recordings.items():

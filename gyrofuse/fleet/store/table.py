@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from gyrofuse._base import __version__
 from gyrofuse.fleet.logs import as_text
 from gyrofuse.fleet.store.sealed import read_sealed
+from gyrofuse.io.streams import not_installed
 
 if TYPE_CHECKING:
     import pyarrow
@@ -253,4 +254,4 @@ def need_arrow(path: Path) -> None:
     try:
         import pyarrow  # noqa: F401
     except ImportError as error:
-        raise ImportError(f'{path}: writing Parquet needs pyarrow; pip install "gyrofuse[logs]"') from error
+        raise not_installed(path, "writing Parquet", "pyarrow") from error

@@ -100,7 +100,7 @@ class CoherenceRemainder(Spectral):
         return _at(coherence, self.frequency, f) * size[:, :, None] * size[:, None, :].conj()
 
     def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
-        pictures.coherence(ax, comparison, sensor)
+        pictures.coherence(ax, comparison, sensor, (self.after - self.before)[:, sensor].abs().mean(0))
 
     def fit_without(self, comparison: Comparison, fold: int) -> CoherenceRemainder:
         return self._between(without_fold(comparison, fold), comparison.reference)

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gyrofuse._base.axes import BLUE, DASHED, INK, SHADE, finish, with_unit
+from gyrofuse._base.axes import BLUE, DASHED, INK, SHADE, clean_name, finish, with_unit
 from gyrofuse.mismatch.signals.comparison import N_BLOCKS, Comparison, block_means
 from gyrofuse.mismatch.signals.lines import whitened
 from gyrofuse.mismatch.signals.prediction_errors import left_out
@@ -134,25 +134,34 @@ def ratio_of_spectra(ax: Axes, comparison: Comparison, sensor: int, factor: Call
         handles += _plot(ax, hertz, factor(f[known])[sensor], **DASHED)
     ax.set_xscale("log")
     ax.set_yscale("log")
-    _finish(
-        ax,
-        handles,
-        ["recording", "95 % of recordings that agree", "fitted"],
-        "frequency (Hz)",
-        "recording over simulation, power",
-    )
+    labels = ["recording", "95 % of recordings that agree", "fitted"]
+    _finish(ax, handles, labels, "frequency (Hz)", "recording over simulation, power")
 
 
-def coherence(ax: Axes, comparison: Comparison, sensor: int) -> None:
-    """Largest coherence of a sensor with any other one by band of frequency."""
-    hertz = comparison.bands.frequency * comparison.info.rate
+def coherence(ax: Axes, comparison: Comparison, sensor: int, shared: Tensor) -> None:
+    """Coherence of a sensor with the one it shares most with, by band of frequency, and the reach of chance.
+
+    Args:
+        ax: Axes to draw into.
+        comparison: Recording and simulation.
+        sensor: Position of the sensor.
+        shared: How much each sensor shares with it, `(sensor,)`, of any scale.
+    """
+    others = [i for i in range(comparison.n_sensors) if i != sensor]
+    other = max(others, key=lambda i: float(shared[i].abs()))
+    pair = " and ".join(clean_name(comparison.info.sensors[i]) for i in (sensor, other))
+    hertz, dof = comparison.bands.frequency * comparison.info.rate, comparison.observed.coherence_dof
     handles: list[Any] = []
     for side, style in ((comparison.observed, _DOT), (comparison.reference, _LINE)):
-        others = torch.arange(comparison.n_sensors) != sensor
-        handles += _plot(ax, hertz, side.coherence[:, sensor, others].abs().amax(-1), **style)
+        handles += _plot(ax, hertz, side.coherence[:, sensor, other].abs(), **style)
+    # The square of a coherence of `d` ordinates of independent sensors exceeds x with probability (1 - x)^(d - 1).
+    known, chance = dof > 1, 0.05 / len(dof)
+    limit = (1 - chance ** (1 / (dof[known] - 1))).sqrt()
+    handles += _plot(ax, hertz[known], limit, **DASHED)
     ax.set_xscale("log")
     ax.set_ylim(0, 1.02)
-    _finish(ax, handles, ["recording", "simulation"], "frequency (Hz)", "largest coherence with another sensor")
+    labels = [f"recording, {pair}", "simulation", "independent sensors: 1 picture in 20 has a dot above"]
+    _finish(ax, handles, labels, "frequency (Hz)", f"coherence of {pair}")
 
 
 def values(ax: Axes, comparison: Comparison, sensor: int, centre: float, width: float) -> None:
@@ -273,13 +282,8 @@ def tails(ax: Axes, comparison: Comparison, sensor: int) -> None:
     handles += _plot(ax, x, torch.special.erfc(x / math.sqrt(2)), **DASHED)
     ax.set_yscale("log")
     ax.set_ylim(bottom=0.3 / comparison.n_samples)
-    _finish(
-        ax,
-        handles,
-        ["recording", "simulation", "normal noise"],
-        "size of a prediction error (standard deviations)",
-        "share beyond it",
-    )
+    labels = ["recording", "simulation", "normal noise"]
+    _finish(ax, handles, labels, "size of a prediction error (standard deviations)", "share beyond it")
 
 
 def variance_over_time(ax: Axes, comparison: Comparison, sensor: int, course: Tensor | None) -> None:

@@ -171,6 +171,27 @@ def prepared(
     return with_spread(comparison.knowing(_lines(simulation, comparison)), noise_samples)
 
 
+def same_data_words(given: Comparison, judge: Recording | Tensor | None) -> str:
+    """A sentence on data that were given twice, sample by sample; empty where none were.
+
+    Args:
+        given: Recording and simulation as they came.
+        judge: Another recording, in the recording's unit; None for none.
+    """
+    others = {"simulation": list(given.reference.signal)}
+    if judge is not None:
+        others["judge"] = [judge.signal if isinstance(judge, Recording) else judge]
+    for name, signals in others.items():
+        for signal in signals:
+            n = min(signal.shape[-1], given.n_samples)
+            if torch.equal(signal[:, :n].to(given.recording), given.recording[:, :n]):
+                return (
+                    f"Recording and {name} are the same data, sample by sample: that they agree says nothing. Give "
+                    f"another {name}."
+                )
+    return ""
+
+
 def _lines(simulation: Recording | Tensor | Model | ArrayModel, comparison: Comparison) -> tuple[float, ...]:
     """Frequencies of the simulation's tones, cycles per sample: those that its model names, and those to be seen.
 

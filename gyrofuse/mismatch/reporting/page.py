@@ -12,6 +12,7 @@ import torch
 from gyrofuse._base.axes import with_unit
 from gyrofuse._base.page import image, number, render
 from gyrofuse._base.results import format_p_value, readable
+from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.mechanisms.catalogue import STAGES, named
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
 from gyrofuse.mismatch.reporting.figures_data import VarianceComparison, compared_powers, grouped_spectrum
@@ -28,12 +29,15 @@ from gyrofuse.mismatch.reporting.text import (
     ALIKE,
     benefit_of,
     capital,
+    chance_words,
     family_words,
     fused_words,
+    headline,
     judged_shares,
     nats,
     otherwise_words,
     parameter_words,
+    typeset,
     verdict,
 )
 from gyrofuse.mismatch.selection.shares import Share
@@ -77,10 +81,12 @@ def mismatch_page(outcome: Outcome, *, title: str, remarks: Sequence[str] = ()) 
         outcome=outcome,
         family_words=family_words,
         info=info,
-        verdict=[_typeset(sentence) for sentence in verdict(outcome)],
+        headline=typeset(headline(outcome)),
+        verdict=[typeset(sentence) for sentence in verdict(outcome)],
         remarks=remarks,
         shares=image(_WIDTH, 0.8 + 0.26 * (len(shares) + 1), _draw_shares, before, shares) if shares else None,
         judge=judge,
+        overshoots=min([share.share for share in shares] + [1 - sum(share.share for share in shares)]) < 0,
         parts=[_part(outcome, f) for f in outcome.findings],
         repaired=repaired,
         level_map=image(_WIDTH, panels * (rows + 0.75), _draw_maps, outcome, [v.z for v in variances]),
@@ -135,7 +141,7 @@ def _part(outcome: Outcome, finding: Finding) -> dict[str, Any]:
     }
     return {
         "name": readable(finding.mechanism),
-        "sentence": _typeset(capital(finding.sentence)),
+        "sentence": typeset(capital(finding.sentence)),
         "facts": {name: value for name, value in facts.items() if value},
         "picture": image(_WIDTH, 2 * _PICTURE, _draw_finding, finding),
         "parameters": [
@@ -147,11 +153,6 @@ def _part(outcome: Outcome, finding: Finding) -> dict[str, Any]:
             for name in finding.alternatives
         ],
     }
-
-
-def _typeset(sentence: str) -> str:
-    """With arrows that no line is broken in."""
-    return sentence.replace("->", "→")
 
 
 def _times(levels: tuple[int, ...], rate: float) -> str:
@@ -182,13 +183,21 @@ def _tests(outcome: Outcome) -> list[dict[str, Any]]:
             "name": readable(before.test),
             "p": format_p_value(before.p_value),
             "p_after": format_p_value(after.p_value),
-            "words": capital(before.words),
+            "chance": chance_words(before.p_value),
+            "words": _seen_words(before, before.test in left or before.p_value * len(outcome.evidence) < 0.01),
             "words_after": capital(after.words),
             "surprised": before.p_value * len(outcome.evidence) < 0.01,
             "left": before.test in left,
         }
         for before, after in zip(outcome.evidence, outcome.evidence_after, strict=True)
     ]
+
+
+def _seen_words(result: TestResult, beyond_chance: bool) -> str:
+    """What a test found: where it is no more than chance gives, as the most extreme of all that it looked at."""
+    if beyond_chance or not result.sensors:  # of no sensors: why nothing was tested
+        return capital(result.words)
+    return f"Nothing beyond chance; most extreme: {result.words}"
 
 
 def _looked_for(outcome: Outcome) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -98,7 +99,7 @@ def plot_map(
 
 
 def plot_shares(before: float, shares: Sequence[Share], *, ax: Axes | None = None) -> Axes:
-    """Draw how far repair after repair brings a discrepancy down, with the share of it that each carries.
+    """Draw the share of a discrepancy that each repair carries, with the discrepancies before it and after it.
 
     Args:
         before: Discrepancy per degree of freedom before any repair.
@@ -109,35 +110,31 @@ def plot_shares(before: float, shares: Sequence[Share], *, ax: Axes | None = Non
         The axes.
     """
     ax = ax if ax is not None else new_axes()
-    start = before
-    for row, share in enumerate(shares):
-        colour = BLUE if share.identified else FRAME
-        ax.barh(row, share.discrepancy - start, left=start, height=0.55, color=colour, zorder=3)
+    percent = [100 * share.share for share in shares]
+    percent.append(100 - sum(percent))  # what is left
+    ends = [before, *(share.discrepancy for share in shares)]
+    words = [f"{start:.3g} → {end:.3g}" for start, end in pairwise(ends)] + [f"{ends[-1]:.3g}"]
+    colours = [BLUE if share.identified else FRAME for share in shares] + [ORANGE]
+    rows = range(len(percent))
+    ax.barh(rows, percent, height=0.55, color=colours, zorder=3)
+    for row, value, change in zip(rows, percent, words, strict=True):
         ax.annotate(
-            f"{100 * share.share:.3g} %",
-            (max(start, share.discrepancy), row),
+            f"{value:.3g} %   ({change})",
+            (max(value, 0.0), row),
             (4, 0),
             textcoords="offset points",
             va="center",
             fontsize=TICK_SIZE,
             color=INK,
         )
-        start = share.discrepancy
-    last = len(shares)
-    left = 1 - sum(share.share for share in shares)
-    ax.barh(last, start - 1, left=1, height=0.55, color=ORANGE, zorder=3)
-    ax.annotate(
-        f"{100 * left:.3g} %", (max(start, 1), last), (4, 0), textcoords="offset points", va="center",
-        fontsize=TICK_SIZE, color=INK,
-    )  # fmt: skip
-    ax.axvline(1, color=INK, linewidth=0.8, zorder=2)
-    ax.set_xscale("log")
-    ends = [1.0, before, *(share.discrepancy for share in shares)]
-    ax.set_xlim(min(ends) / 1.3, max(ends) * (max(ends) / min(ends)) ** 0.12 * 1.1)
+    ax.axvline(0, color=INK, linewidth=0.8, zorder=4)
+    reach = max(percent)
+    ax.set_xlim(1.05 * min(0.0, *percent), 1.4 * reach)  # with room for the words
+    ax.set_xticks([tick for tick in ax.get_xticks() if ax.get_xlim()[0] <= tick <= max(reach, 100)])
     names = [readable(share.name) if share.identified else f"{readable(share.name)} (no name)" for share in shares]
-    ax.set_yticks(range(last + 1), [*names, "left"], parse_math=False)
-    ax.set_ylim(last + 0.6, -0.6)
-    ax.set_xlabel("discrepancy (1 = noise alone)")
+    ax.set_yticks(rows, [*names, "left"], parse_math=False)
+    ax.set_ylim(len(shares) + 0.6, -0.6)
+    ax.set_xlabel("share of the discrepancy above noise alone (%)")
     finish(ax)
     ax.grid(visible=False, axis="y")
     return ax

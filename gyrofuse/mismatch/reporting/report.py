@@ -59,7 +59,7 @@ class MismatchReport(Outcome):
             lines.append(f"{i}. {finding.mechanism}: {finding.sentence} ({p_words(finding.p_value)}{gain})")
             lines += [f"   {words}" for words in (otherwise_words(finding),) if words]
             if finding.gain_without is not None and len(self.findings) > 1:
-                lines.append(f"   left out alone, it would cost {nats(finding.gain_without)} nats (held out)")
+                lines.append(f"   without it held-out data are predicted worse by {nats(finding.gain_without)} nats")
             for name, entry in finding.parameters.items():
                 words = parameter_words(name, self.comparison.info.sensors)
                 lines.append(f"   {words:<24} {entry.value:>12.6g} {entry.unit}  ({entry.low:.6g} to {entry.high:.6g})")
@@ -70,7 +70,9 @@ class MismatchReport(Outcome):
             f"{paired_words(h)}log score: {family_words(h)}; a classifier tells the two apart with an area under the "
             f"curve of {h.auc_before:.2f} before and {h.auc_after:.2f} after (0.5 = guessing)"
         )
-        return "\n".join([*lines, *self.notes, *judged_words(self), *share_words(self), *fused_words(self)])
+        lines += [*self.notes, *judged_words(self), *share_words(self), *fused_words(self)]
+        foot = "Nats, held out, discrepancy, area under a curve: explained at the foot of the page (to_html, --report)."
+        return "\n".join([*lines, foot])
 
     def __str__(self) -> str:
         return self.summary()

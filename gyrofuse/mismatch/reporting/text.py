@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 
 from gyrofuse._base.linalg import SingularCovarianceError
 from gyrofuse._base.results import p_words, readable
@@ -14,6 +15,23 @@ from gyrofuse.mismatch.selection.held_out import HeldOut
 from gyrofuse.mismatch.selection.shares import Share
 
 ALIKE = 0.01  # relative change of a variance that is not worth a word
+
+
+def headline(outcome: Outcome) -> str:
+    """What was found, and how much better the repaired simulation is, at a glance."""
+    if not outcome.mismatch:
+        return f"Nothing found: recording and simulation agree ({p_words(outcome.p_value)})."
+    held_out = outcome.held_out
+    gains = [f"{nats(score.value)} nats ({name})" for name, score in held_out.families.items()]
+    likelier = f"Held-out data become likelier by {', '.join(gains)}; discrepancy" if gains else "Discrepancy"
+    return f"Found: {found_words(outcome)}. {likelier} {held_out.before:.3g} -> {held_out.after:.3g} (1 = noise alone)."
+
+
+def found_words(outcome: Outcome) -> str:
+    """Names of the findings, each once, with how many there are."""
+    counts = Counter(readable(f.mechanism) for f in outcome.findings)
+    words = ", ".join(name if n == 1 else f"{n} x {name}" for name, n in counts.items())
+    return words or "a difference that could not be named"
 
 
 def verdict(outcome: Outcome) -> list[str]:
@@ -44,16 +62,31 @@ def verdict(outcome: Outcome) -> list[str]:
 
 
 def otherwise_words(finding: Finding) -> str:
-    """What would be with its best look-alike in the place of a finding; nothing where it has none."""
-    if finding.instead is None or finding.gain_without is None:
+    """What its closest look-alike in the place of a finding says of its name; nothing where it has none."""
+    rival = finding.instead
+    if rival is None or finding.gain_without is None:
         return ""
-    less, sd = finding.gain_without - finding.instead.gain, finding.instead.sd
-    start = f"instead of {readable(finding.mechanism)}: {readable(finding.instead.mechanism)}"
-    alike = "cannot be told from it, and " if finding.instead.mechanism in finding.alternatives else ""
-    if finding.instead.beats(finding.gain_without):
-        alike = "is likelier, and "
-    more = f"{nats(abs(less))} nats {'less' if less >= 0 else 'more'}"
-    return f"{start} {alike}would gain {more} (held out, standard deviation {nats(sd)})"
+    less = finding.gain_without - rival.gain
+    start = f"closest look-alike of {readable(finding.mechanism)}: {readable(rival.mechanism)}, which in its place"
+    size = f"by {nats(abs(less))} nats (standard deviation {nats(rival.sd)})"
+    better = f"predicts held-out data {'worse' if less >= 0 else 'better'} {size}"
+    if rival.beats(finding.gain_without):
+        return f"{start} {better}: the name given here is in doubt"
+    if rival.mechanism in finding.alternatives:
+        return f"{start} {better}: these data do not tell which of the two it is"
+    if rival.gain <= 0:
+        return f"{start} explains nothing of the held-out data"
+    return f"{start} {better}: it is ruled out"
+
+
+def chance_words(p_value: float) -> str:
+    """How often chance alone gives as small a p value: `1 of 250`."""
+    certain, many = 1e-6, 0.1  # below which numbers mean nothing to readers, and from which tenths are said
+    if p_value < certain:
+        return "less than 1 of a million"
+    if p_value >= many:
+        return f"{round(10 * p_value)} of 10"
+    return f"1 of {float(f'{1 / p_value:.2g}'):,.0f}".replace(",", " ")
 
 
 def share_words(outcome: Outcome) -> list[str]:
@@ -65,9 +98,12 @@ def share_words(outcome: Outcome) -> list[str]:
     unnamed = 100 * sum(share.share for share in shares if not share.identified)
     left = 100 - named - unnamed
     known = f", curves without a name {unnamed:.3g} %" if any(not share.identified for share in shares) else ""
+    rest = f"{left:.3g} % is left" if left > 0 else "nothing is left: it is closer than noise alone is on average"
+    if min(named, unnamed) < 0:
+        rest += " (below 0 %: these repairs by themselves take the simulation further away, and others make up for it)"
     return [
         f"Of the discrepancy above noise alone, {before - 1:.3g} {where}, mechanisms with names carry {named:.3g} %"
-        f"{known}; {left:.3g} % is left"
+        f"{known}; {rest}"
     ]
 
 
@@ -148,6 +184,11 @@ def parameter_words(name: str, sensors: tuple[str, ...]) -> str:
 def capital(sentence: str) -> str:
     """With a capital first letter and no full stop."""
     return sentence[:1].upper() + sentence[1:].rstrip(".")
+
+
+def typeset(sentence: str) -> str:
+    """With arrows that no line is broken in."""
+    return sentence.replace("->", "→")
 
 
 def family_words(held_out: HeldOut) -> str:

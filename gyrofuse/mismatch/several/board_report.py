@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 from gyrofuse._base.results import cleaned, p_words, readable
 from gyrofuse.mismatch.mechanisms.mechanism import Finding
 from gyrofuse.mismatch.repair.repaired_model import RepairedModel
-from gyrofuse.mismatch.reporting.text import capital, judged_words, parameter_words
+from gyrofuse.mismatch.reporting.text import capital, judged_words, parameter_words, typeset
 from gyrofuse.mismatch.several.board_causes import BoardCause, Member
 from gyrofuse.mismatch.several.several_reports import SeveralReports, listed_words, picture
 
@@ -85,6 +85,7 @@ class BoardReport(SeveralReports):
         return {
             "name": readable(cause.mechanism),
             "where": self.where(cause),
+            "short": f"in {self.where(cause)}; where it is clearest, {typeset(cause.clearest.finding.sentence)}",
             "members": [_member(member) for member in cause.members],
         }
 
@@ -93,7 +94,7 @@ def _member(member: Member) -> dict[str, Any]:
     info = member.comparison.info
     return {
         "group": member.group,
-        "sentence": capital(member.finding.sentence).replace("->", "→"),
+        "sentence": typeset(capital(member.finding.sentence)),
         "picture": picture(member.finding),
         "parameters": [
             {"name": parameter_words(name, info.sensors), "entry": entry}

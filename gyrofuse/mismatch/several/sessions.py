@@ -69,15 +69,18 @@ def diagnose_sessions(
         judge = checked_judge(on_processor(judge), recordings[0], rate)
     reports = []
     for k, recording in enumerate(recordings):
-        report = diagnose(
-            recording,
-            simulation,
-            false_alarm=sidak_level(false_alarm, len(recordings)),
-            rate=rate,
-            fitted_samples=fitted_samples,
-            generator=generator,
-            progress=part_of(progress, names, k),
-        )
+        try:
+            report = diagnose(
+                recording,
+                simulation,
+                false_alarm=sidak_level(false_alarm, len(recordings)),
+                rate=rate,
+                fitted_samples=fitted_samples,
+                generator=generator,
+                progress=part_of(progress, names, k),
+            )
+        except ValueError as error:
+            raise ValueError(str(error).replace("`recording`", f"`recordings`: {names[k]}")) from None
         reports.append(report)
     model = SessionModel(tuple(report.model for report in reports))
     verdict = None

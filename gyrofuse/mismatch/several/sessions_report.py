@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 from gyrofuse._base.results import cleaned, readable
 from gyrofuse.mismatch.repair.session_model import SessionModel
 from gyrofuse.mismatch.reporting.judge import Judged
-from gyrofuse.mismatch.reporting.text import capital, judge_words, parameter_words
+from gyrofuse.mismatch.reporting.text import capital, judge_words, parameter_words, typeset
 from gyrofuse.mismatch.several.recurrence import Cause, CommonParameter
 from gyrofuse.mismatch.several.several_reports import SeveralReports, listed_words, picture
 
@@ -90,7 +90,8 @@ class SessionsReport(SeveralReports):
         return {
             "name": readable(cause.mechanism),
             "whose": _WHOSE[cause.scope],
-            "sentence": capital(self.cause_sentence(cause)).replace("->", "→"),
+            "sentence": typeset(capital(self.cause_sentence(cause))),
+            "short": f"{_WHOSE[cause.scope]}, {typeset(self.cause_sentence(cause))}",
             "recordings": [self.names[k] for k in cause.findings],
             "picture": picture(cause.clearest),
             "parameters": [

@@ -101,7 +101,7 @@ class SeveralReports:
             title=title,
             report=self,
             remarks=remarks,
-            verdict=[capital(words) for words in self.sentences()],
+            verdict=[f"{capital(words)}." for words in self.sentences()],
             course=image(7.0, 0.9 + 0.3 * len(self.names), draw),
             causes=self.parts(),
         )

@@ -39,7 +39,7 @@ class Pulses(Transient):
     which goes to and fro; like steps, which stay; and like switching between two levels, whose stays are of any length.
 
     Attributes:
-        onset_s: `t_m`, s after the first sample, `(pulse,)`.
+        onset_s: `t_m`, s after the first sample, `(pulse,)`; the strongest is the first.
         width_s: `(pulse,)`.
         power: `q_m`, `(pulse,)`.
         size: `(pulse, sensor)`, unit of the signal; 0 in sensors that do not have it.
@@ -60,12 +60,11 @@ class Pulses(Transient):
         p_value = pulse_p_value(comparison)
         if p_value > level:
             return None
-        pulses = _pulses(comparison)
+        pulses = sorted(_pulses(comparison), key=lambda one: -float(one.log_ratio.sum()))
         if not pulses or _to_and_fro(pulses) or _of_any_length(pulses):
             return None
         info, rate = comparison.info, comparison.info.rate
-        effect = cls.of(pulses, comparison)
-        strongest = max(pulses, key=lambda one: float(one.log_ratio.sum()))
+        effect, strongest = cls.of(pulses, comparison), pulses[0]
         around = _around(comparison, comparison.recording, strongest.pulse)
         width, hours = strongest.pulse.width / rate, effect.duration_s / 3600
         fewest, most = (stats.chi2.ppf(q, 2 * (len(pulses) + more)) / 2 for q, more in ((0.025, 0), (0.975, 1)))
@@ -116,9 +115,9 @@ class Pulses(Transient):
         return replace(self, size=torch.stack(sizes))
 
     def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
-        rate, strongest = comparison.info.rate, int((self.size[:, sensor].abs() * self.width_s.sqrt()).argmax())
-        width = float(self.width_s[strongest]) * rate
-        first = round(float(self.onset_s[strongest]) * rate - 2 * width - 8)
+        rate = comparison.info.rate
+        width = float(self.width_s[0]) * rate  # of the strongest
+        first = round(float(self.onset_s[0]) * rate - 2 * width - 8)
         path = self.path(comparison.n_samples, rate) if fitted else None
         pictures.transient(ax, comparison, sensor, first, round(5 * width) + 24, path)
 

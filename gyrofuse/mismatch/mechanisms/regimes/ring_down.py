@@ -39,7 +39,8 @@ class RingDown(Transient):
     it dies away is two modes that beat, where these are likelier by more than their numbers cost, or has another name.
 
     Attributes:
-        onset_s: `t_m`, s after the first sample, `(tone,)`; modes that set in together are one knock.
+        onset_s: `t_m`, s after the first sample, `(tone,)`; modes that set in together are one knock. The strongest
+            is the first.
         frequency_hz: `f_m`, `(tone,)`.
         decay_s: `tau_m`, `(tone,)`.
         cosine, sine: `(tone, sensor)`, unit of the signal.
@@ -81,12 +82,11 @@ class RingDown(Transient):
         p_value = ring_down_p_value(comparison)
         if p_value > level:
             return None
-        tones = _tones(comparison)
+        tones = sorted(_tones(comparison), key=lambda tone: -float(tone.log_ratio.sum()))
         if not tones:
             return None
         info = comparison.info
-        effect = cls.of(tones, comparison)
-        strongest = max(tones, key=lambda tone: float(tone.log_ratio.sum()))
+        effect, strongest = cls.of(tones, comparison), tones[0]
         around = Surroundings.of(comparison.recording, comparison.base, strongest.tone.onset, strongest.tone.tau)
         frequency_sd, decay_sd, size_sd = around.sd(strongest)
         there = tuple((strongest.size != 0).any(0).nonzero()[:, 0].tolist())
@@ -146,9 +146,9 @@ class RingDown(Transient):
         return self.of(fitted, comparison)
 
     def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
-        rate, strongest = comparison.info.rate, int((self.amplitude[:, sensor] * self.decay_s.sqrt()).argmax())
-        tau = float(self.decay_s[strongest]) * rate
-        first = round(float(self.onset_s[strongest]) * rate - 2 * tau - 8)
+        rate = comparison.info.rate
+        tau = float(self.decay_s[0]) * rate  # of the strongest
+        first = round(float(self.onset_s[0]) * rate - 2 * tau - 8)
         path = self.path(comparison.n_samples, rate) if fitted else None
         pictures.transient(ax, comparison, sensor, first, round(8 * tau) + 24, path)
 

@@ -88,8 +88,8 @@ class RandomTelegraph(Mechanism):
         return Finding(
             cls.name,
             effect,
-            f"the rate jumps between two levels in {where}: {2 * float(effect.half_step[largest]):.3g} "
-            f"{comparison.info.measure} apart in sensor {comparison.info.sensors[largest]}, "
+            f"the rate jumps between two levels in {where}: half a step of {float(effect.half_step[largest]):.3g} "
+            f"{comparison.info.measure} to either side in sensor {comparison.info.sensors[largest]}, "
             f"staying {float(effect.up[largest]):.3g} s "
             f"in the upper and {float(effect.down[largest]):.3g} s in the lower one on average",
             p_value,

@@ -91,13 +91,13 @@ class VarianceChange(ChangingVariance):
             parameters[f"factor[{i}]"] = Parameter(middle, low, high, "")
         scores = two_level_scores(white, found.factor, found.inside(comparison.n_samples), reference)
         gain = float(own_spread(comparison).weight @ scores.sum(-1))
-        largest = max(sensors, key=lambda i: abs(math.log(float(factor[i]))))
+        largest = max(sensors, key=lambda i: abs(math.log(parameters[f"factor[{i}]"].value)))
         where = comparison.info.named(sensors, "all sensors")
         more = f" and {len(found.episodes) - 1} more times" if len(found.episodes) > 1 else ""
         return Finding(
             cls.name,
             effect,
-            f"the noise's variance is {float(factor[largest]):.3g} times the rest (sensor "
+            f"the noise's variance is {parameters[f'factor[{largest}]'].value:.3g} times the rest (sensor "
             f"{comparison.info.sensors[largest]}) from {parameters['start'].value:.6g} s "
             f"to {parameters['stop'].value:.6g} s{more} in {where}",
             p_value,

@@ -72,14 +72,14 @@ class VibrationTone(Mechanism):
         low, value, high = sd[list(present)] * amplitude_limits(snr[list(present)], seen)
         for row in zip(present, value.tolist(), low.tolist(), high.tolist(), strict=True):
             parameters[f"amplitude[{row[0]}]"] = Parameter(*row[1:], comparison.info.measure)
-        largest = max(present, key=lambda i: float(tone.amplitude[i]))
+        largest = max(present, key=lambda i: parameters[f"amplitude[{i}]"].value)
         info = comparison.info
         where = info.named(present, "all sensors")
         return Finding(
             cls.name,
             tone,
             f"a tone at {tone.frequency_hz:.6g} Hz in {where}, of amplitude up to "
-            f"{float(tone.amplitude[largest]):.3g} {info.measure} (sensor {info.sensors[largest]}), "
+            f"{parameters[f'amplitude[{largest}]'].value:.3g} {info.measure} (sensor {info.sensors[largest]}), "
             f"that the simulation does not have; without a filter before sampling it may be one at "
             f"{info.rate - tone.frequency_hz:.6g}, {info.rate + tone.frequency_hz:.6g} .. Hz",
             line.p_value,

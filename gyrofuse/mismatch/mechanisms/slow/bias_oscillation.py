@@ -63,7 +63,8 @@ class BiasOscillation(SlowEffect):
         scan, info = strong.scan, comparison.info
         found = estimate(strong.analysis, scan)
         period, effect = in_seconds(found.points[0], info.rate), cls.of(scan, info.rate)
-        finding = slow_finding(comparison, strong, effect, found, f"swings with a period of {period.value:.4g} s", {})
+        words, sizes = f"swings with a period of {period.value:.4g} s", [("amplitude", info.measure)]
+        finding = slow_finding(comparison, strong, effect, found, words, {}, sizes=sizes)
         amplitude, sd = effect.amplitude, (effect.sizes * found.sd).square().sum(-1).sqrt() / effect.amplitude
         limits = {
             f"amplitude[{i}]": Parameter(a, max(a - Z * s, 0.0), a + Z * s, info.measure)

@@ -239,7 +239,7 @@ def slow_finding(
     """
     info = comparison.info
     scan, sizes = strong.scan, sizes or [("size", info.measure)]
-    which = scan.sensors
+    which, of = scan.sensors, sizes[0][0]
     limits = {}
     for path, (name, unit) in enumerate(sizes[: found.size.shape[-1]]):
         for i in which:
@@ -252,8 +252,8 @@ def slow_finding(
     return Finding(
         effect.name,
         effect,
-        f"the bias of {info.named(which)} {words}, by up to {float(up_to[largest]):.3g} {sizes[0][1]} "
-        f"(sensor {info.sensors[largest]})",
+        f"the bias of {info.named(which)} {words}, with a {of} of up to "
+        f"{float(up_to[largest]):.3g} {sizes[0][1]} (sensor {info.sensors[largest]})",
         scan.p_value,
         which,
         {**numbers, **limits},

@@ -104,8 +104,8 @@ class CommonMode(Addition):
             shape,
             sensors,
             parameters,
-            f"{_WORDS[term.kind]} common to {where} that the simulation does not have, up to "
-            f"{float(size.max()):.3g} {unit}{sign}{share}",
+            f"{_WORDS[term.kind]} common to {where} that the simulation does not have, with a gain of "
+            f"up to {float(size.max()):.3g} {unit}{sign}{share}",
         )
 
     @classmethod
@@ -140,7 +140,7 @@ class CommonMode(Addition):
         return (1 - part).clamp(min=_REST).sqrt()
 
     def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
-        pictures.coherence(ax, comparison, sensor)
+        pictures.coherence(ax, comparison, sensor, self.gain)
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
         own = filtered(signal, self.left) if self.inside else signal

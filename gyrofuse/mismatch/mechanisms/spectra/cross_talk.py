@@ -97,7 +97,7 @@ class CrossTalk(Spectral):
         return replace(self, mixing=found.matrix)
 
     def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
-        pictures.coherence(ax, comparison, sensor)
+        pictures.coherence(ax, comparison, sensor, self.mixing[sensor].abs() + self.mixing[:, sensor].abs())
 
 
 def _largest(mixing: Tensor, told: Tensor, info: RecordingInfo) -> str:

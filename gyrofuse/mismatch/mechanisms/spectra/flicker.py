@@ -67,7 +67,7 @@ class FlickerNoise(Addition):
             shape,
             sensors,
             parameters,
-            f"1/f noise in {where} that the simulation does not have, up to {largest:.3g} "
+            f"1/f noise in {where} that the simulation does not have, of a level of up to {largest:.3g} "
             f"{comparison.info.measure} rms in each factor e of frequency",
         )
 

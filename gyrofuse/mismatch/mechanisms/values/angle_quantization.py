@@ -82,8 +82,8 @@ class AngleQuantization(Addition):
             shape,
             sensors,
             parameters,
-            f"quantisation noise of the angle in {info.named(sensors, 'all sensors')} beyond the simulation's, up to"
-            f" {math.sqrt(2 * float(q[largest])):.3g} {info.measure} rms (sensor {info.sensors[largest]})",
+            f"quantisation noise of the angle in {info.named(sensors, 'all sensors')} beyond the simulation's, an angle"
+            f" of up to {parameters[f'angle[{largest}]'].value:.3g} {unit} rms (sensor {info.sensors[largest]})",
         )
 
     @classmethod
