@@ -225,7 +225,7 @@ def _(setting: Setting) -> Drawn:
 
 @draws(Pulses)
 def _(setting: Setting) -> Drawn:
-    n, seconds = 6, setting.n_samples / RATE  # expected in the record, all alike
+    n, seconds = 4, setting.n_samples / RATE  # expected in the record, all alike
     width, size = setting.even(6.0, 20.0) / RATE, setting.signed(5.0, 7.0) * setting.size
     one = torch.ones(1, dtype=torch.float64)
     effect = Pulses(0 * one, width * one, one, size[None], seconds / n)

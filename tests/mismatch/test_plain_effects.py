@@ -196,3 +196,21 @@ def test_paths_of_noise_have_a_mean_likelihood_ratio_below_one() -> None:
     ratios = torch.tensor([line.log_ratio for line in found]).exp()
     assert float(ratios.clamp(max=1e3).mean()) < 2
     assert int((ratios > 20).sum()) <= 6
+
+
+def test_errors_far_beyond_the_noise_are_outliers_and_no_noise() -> None:
+    x = noise(5)
+    at = np.random.default_rng(5).choice(N, 40, replace=False)
+    x[1, at] += 400 * np.sign(np.random.default_rng(6).standard_normal(40))
+    report = diagnosed(x)
+    assert [(f.mechanism, f.sensors) for f in report.findings] == [("spikes", (1,))]
+    assert not report.unexplained
+    (found,) = report.findings
+    assert found.parameters["amplitude[1]"].low < 400 < found.parameters["amplitude[1]"].high
+
+
+def test_physics_is_complete_only_where_nothing_else_is_seen() -> None:
+    complete = "The physics is complete, the numbers were wrong."
+    assert complete in diagnosed(1.3 * noise(7)).summary()
+    at_random = np.random.default_rng(8).choice([1.0, 3.0], N // 512 + 1).repeat(512)[:N]
+    assert complete not in diagnosed(at_random * noise(8)).summary()

@@ -97,6 +97,11 @@ class Mechanism:
         """Position in which it acts on a simulation; what is additive comes on top of all that is noise."""
         return self.stage, self.additive
 
+    @property
+    def only_numbers(self) -> bool:
+        """Whether the simulation has its physics, with other numbers."""
+        return False
+
     @classmethod
     def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
         """The strongest instance that the recording shows at a p value below `level`, if any.

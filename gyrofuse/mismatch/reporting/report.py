@@ -12,6 +12,7 @@ from gyrofuse.mismatch.reporting.outcome import Outcome
 from gyrofuse.mismatch.reporting.page import mismatch_page
 from gyrofuse.mismatch.reporting.plots import plot_map
 from gyrofuse.mismatch.reporting.text import (
+    complete_words,
     family_words,
     fused_words,
     judged_words,
@@ -63,6 +64,7 @@ class MismatchReport(Outcome):
             for name, entry in finding.parameters.items():
                 words = parameter_words(name, self.comparison.info.sensors)
                 lines.append(f"   {words:<24} {entry.value:>12.6g} {entry.unit}  ({entry.low:.6g} to {entry.high:.6g})")
+        lines += complete_words(self)
         lines += [f"unexplained, {e.test}: {e.words} ({p_words(e.p_value)})" for e in self.unexplained]
         h = self.held_out
         lines.append(

@@ -34,6 +34,12 @@ def found_words(outcome: Outcome) -> str:
     return words or "a difference that could not be named"
 
 
+def complete_words(outcome: Outcome) -> list[str]:
+    """That nothing is missing but numbers, where every finding is of that kind and no test sees anything else."""
+    only_numbers = bool(outcome.findings) and all(f.effect.only_numbers for f in outcome.findings)
+    return ["The physics is complete, the numbers were wrong."] if only_numbers and not outcome.unexplained else []
+
+
 def verdict(outcome: Outcome) -> list[str]:
     """Say in sentences whether recording and simulation differ, by what, and what the repair is worth."""
     if not outcome.mismatch:
@@ -49,6 +55,7 @@ def verdict(outcome: Outcome) -> list[str]:
     if not any(f.identified for f in outcome.findings):
         sentences.append("What the simulation leaves out could not be named.")
     sentences += [f"{capital(f.sentence)}." for f in outcome.findings]
+    sentences += complete_words(outcome)
     if outcome.held_out.families:
         sentences.append(
             "On data that no number was estimated from, the repaired simulation predicts the recording better: "

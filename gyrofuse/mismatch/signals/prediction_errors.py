@@ -17,7 +17,7 @@ from typing import NamedTuple
 import torch
 from scipy import fft
 from torch import Tensor
-from torch.nn.functional import pad
+from torch.nn.functional import max_pool1d, pad
 
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.noise_spectrum import let_in
@@ -93,7 +93,28 @@ def scaled_innovations(signal: Tensor, factors: Tensor) -> Tensor:
 
 
 def _errors(signal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Prediction errors and whitened signal `(time,)`, and whether its ends are larger than the rest."""
+    """Prediction errors and whitened signal `(time,)`, and whether its ends are larger than the rest.
+
+    Samples that are far off are no part of the spectrum, nor of what predicts their neighbours: they are taken out
+    until no other one is.
+    """
+    far, apart, rounds, most = 30.0, 9, 4, len(signal) // 200  # sd; samples, of which the farthest is off; number
+    found, taken = _errors_of(signal), torch.zeros_like(signal)
+    for _ in range(rounds):
+        size = found[0].abs()
+        off = (size > far * median_sd(found[0])) & (size == max_pool1d(size[None], apart, 1, apart // 2)[0])
+        if not bool(off.any()):
+            break
+        taken = taken + torch.where(off, found[0], 0.0)
+        if int((taken != 0).sum()) > most:  # more than outliers
+            return _errors_of(signal)
+        found = _errors_of(signal - taken)
+    error, white, leaks = found
+    return error + taken, white + taken / median_sd(error), leaks
+
+
+def _errors_of(signal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The same with all samples in."""
     y = torch.from_numpy(fft.dct(signal.numpy(), norm="ortho"))[1:]
     spectrum, followed = _smooth_spectrum(y)
     lines = _lines(y, spectrum)

@@ -45,6 +45,10 @@ class ToneSize(Mechanism):
     frequency_hz: float
     amplitude: OfSensors
 
+    @property
+    def only_numbers(self) -> bool:
+        return True
+
     @classmethod
     def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
         sizes = line_sizes(comparison)

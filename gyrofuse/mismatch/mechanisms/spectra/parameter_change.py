@@ -120,6 +120,11 @@ class ParameterShift(Filter):
         slow = bool((self.log_factors[1:] != 0).any())  # of the simulation's parts all but the white one
         return happened_instead(comparison, finding, beside, walks_of(comparison, finding) if slow else None)
 
+    @property
+    def only_numbers(self) -> bool:
+        lacks = Parts(self.base, torch.tensor([1 / self.base.n_samples], dtype=torch.float64)).lacks
+        return not bool((lacks & (self.log_factors[[0, 1, 3]] != 0)).any())
+
     @classmethod
     def from_term(cls, term: Term, comparison: Comparison) -> ParameterShift | None:
         return cls(reference_noise(comparison), term.local) if isinstance(term, Shift) else None
@@ -147,7 +152,7 @@ def _said_of(lacking: Set[str], shape: Shape) -> str:
     if any(term.acts == "filter" for term in shape.company) and bool(((white > 0) & (ar1 < -1)).any()):
         return "AR1 noise of the simulation stands for a filter of white noise"
     if not lacking:
-        return "the physics is complete, the numbers were wrong"
+        return "the simulation's numbers are off"
     return f"the simulation shows no {' and no '.join(sorted(lacking))} where the recording does"
 
 
