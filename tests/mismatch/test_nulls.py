@@ -14,6 +14,7 @@ from scipy.signal import butter, lfilter
 from torch import Tensor
 
 import gyrofuse as gf
+from gyrofuse.mismatch.detectors.lines.clocks import clock_test
 from gyrofuse.mismatch.detectors.spectra.band_tests import spectrum_test
 from gyrofuse.mismatch.detectors.spectra.shape_scan import shape_test
 from gyrofuse.mismatch.detectors.tests import family_wise_p_value, run_tests
@@ -404,3 +405,32 @@ def test_what_a_filter_leaves_alike_on_both_sides_is_no_mismatch(form: str):
         results = run_tests(Comparison.of(RecordingInfo(100.0, "deg/s", ("1", "2", "3")), made[0], made[1:]))
         alarms += family_wise_p_value(results) < 0.01
     assert alarms <= 1  # two of six come by chance once in 700 times
+
+
+def test_a_tone_that_fades_on_both_sides_slips_nowhere():
+    """Once it has died away, any phase is as good as another one."""
+    n, rate, g = 16_384, 200.0, torch.Generator().manual_seed(4)
+    t = torch.arange(n, dtype=torch.float64)
+    for _ in range(3):
+        both = []
+        for _ in range(2):
+            turn = 2 * math.pi * float(torch.rand((), generator=g))
+            fading = 0.9 * torch.exp(-t / 4500) * torch.sin(2 * math.pi * 0.165 * t + turn)
+            both.append(torch.randn(3, n, generator=g, dtype=torch.float64) + fading)
+        comparison = Comparison.of(RecordingInfo(rate, "deg/s", ("1", "2", "3")), both[0], both[1][None])
+        assert clock_test(comparison).p_value > 1e-3
+
+
+def test_faint_lines_that_both_sides_have_are_no_difference():
+    n, g = 16_384, torch.Generator().manual_seed(5)
+    t = torch.arange(n, dtype=torch.float64)
+    seen = 0
+    for _ in range(12):
+        both = []
+        for _ in range(2):
+            turn = 2 * math.pi * float(torch.rand((), generator=g))
+            faint = 0.055 * torch.sin(2 * math.pi * 0.19 * t + turn)
+            both.append(torch.randn(3, n, generator=g, dtype=torch.float64) + faint)
+        comparison = Comparison.of(RecordingInfo(200.0, "deg/s", ("1", "2", "3")), both[0], both[1][None])
+        seen += comparison.line.p_value < 0.01
+    assert seen <= 1

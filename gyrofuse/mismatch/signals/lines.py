@@ -79,12 +79,28 @@ def strongest_line(observed: Records, reference: Records) -> FoundLine:
         here = (f - line).abs() < (_GUARD + 1) / shortest
         known |= here | ((f - line).abs() < _reach(z[:, here]) / observed.signal.shape[-1])
     lines = _lines(z, length, observed, reference.base, known)
-    at = int(lines.log_p.argmin())
+    order = lines.log_p.argsort().tolist()
+    at = next((k for k in order if not _as_faint(float(lines.frequency[k]), observed, reference)), order[-1])
     # Neighbouring fine bins share their noise: 0.6 of them are independent.
     p_value = sidak(math.exp(float(lines.log_p[at])), 0.6 * lines.n_bins)
     sensors = sets_of(len(z))[0][int(lines.best[at])].nonzero()[:, 0].tolist()
     # Where lines of the simulation cover all, there is no candidate but frequency zero.
     return FoundLine(max(float(lines.frequency[at]), 1 / length), p_value, tuple(sensors))
+
+
+def _as_faint(f: float, observed: Records, reference: Records) -> bool:
+    """Whether a line stands out in the simulation as well, though not in all of its spectrum, half as large or larger.
+
+    Two faint ones, of which by chance one is below what is seen among all frequencies, are no difference.
+    """
+    near = 1 / min(observed.signal.shape[-1], reference.signal.shape[-1])
+    there = [
+        float(line)
+        for lines, _ in _lines_of_records(reference)
+        for line, log_p in zip(lines.frequency, lines.log_p.tolist(), strict=True)
+        if log_p < math.log(CERTAIN) and abs(float(line) - f) < near
+    ]
+    return bool(_shared(tuple(there[:1]), observed, reference))
 
 
 def _shared(lines: tuple[float, ...], observed: Records, reference: Records) -> list[float]:
@@ -100,18 +116,28 @@ def _shared(lines: tuple[float, ...], observed: Records, reference: Records) -> 
 
 
 @derived
+def _lines_of_records(side: Records) -> tuple[tuple[Lines, list[float]], ...]:
+    """Candidates of each record of noise, and how far each reaches, cycles per sample."""
+    found = []
+    for signal in side.noise:
+        z, length = _transformed(signal, side.base)
+        lines = _lines(z, length, side, side.base, torch.zeros(z.shape[-1], dtype=torch.bool))
+        reach = [_reach(z[:, round(f * length)][:, None]) / signal.shape[-1] for f in lines.frequency.tolist()]
+        found.append((lines, reach))
+    return tuple(found)
+
+
+@derived
 def simulated_lines(side: Records) -> tuple[float, ...]:
     """Frequencies of lines that a simulation has in any of its records, cycles per sample.
 
     Those that are known, and others by their p value, strongest first.
     """
     found: list[tuple[float, float, float]] = []
-    for signal in side.noise:
-        z, length = _transformed(signal, side.base)
-        lines = _lines(z, length, side, side.base, torch.zeros(z.shape[-1], dtype=torch.bool))
-        for log_p, f in zip(lines.log_p.tolist(), lines.frequency.tolist(), strict=True):
+    for lines, reaches in _lines_of_records(side):
+        for log_p, f, far in zip(lines.log_p.tolist(), lines.frequency.tolist(), reaches, strict=True):
             if log_p + math.log(lines.n_bins * len(side.signal)) < math.log(CERTAIN):
-                found.append((log_p, f, _reach(z[:, round(f * length)][:, None]) / signal.shape[-1]))
+                found.append((log_p, f, far))
     kept: list[tuple[float, float]] = []
     for _, f, reach in sorted(found):
         if all(abs(f - other) > far for other, far in kept):

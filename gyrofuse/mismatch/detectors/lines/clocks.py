@@ -117,7 +117,8 @@ def strongest_slip(comparison: Comparison) -> Slip | None:
         tones.append(found.frequency)
     if not tones:
         return None
-    slips = [slip for f in tones for slip in _of_tone(comparison, f, tuple(other for other in lines if other != f))]
+    apart = 4 / comparison.n_samples  # a tone that fades is wider than a bin, and its skirts are no other lines
+    slips = [slip for f in tones for slip in _of_tone(comparison, f, tuple(o for o in lines if abs(o - f) > apart))]
     slips += [slip for f in tones if f in lines and (slip := _from_simulated(comparison, f)) is not None]
     best = max(slips, key=lambda slip: slip.log_ratio, default=None)
     return None if best is None else replace(best, log_ratio=best.log_ratio - math.log(2 * len(tones)))
@@ -195,6 +196,20 @@ def demodulated(signal: Tensor, f: float) -> Tensor:
     return z / noise.sqrt().clamp(min=1e-300)
 
 
+def _course(z: Tensor) -> Tensor:
+    """Amplitude of a tone in the blocks of rows `(row, block)`, of mean square one: weights; ones where it is steady.
+
+    Where it has died away a phase is that of noise, and with a steady weight as good as any other.
+    """
+    part, sure = 32, 6.0  # blocks; standard deviations
+    power = z.abs().square().unflatten(-1, (-1, part)).mean((0, -1)) - 1  # (part,)
+    sd = ((1 + 2 * power.mean().clamp(min=0)) / (part * len(z))).sqrt()
+    if float((power - power.mean()).abs().amax()) < sure * float(sd):
+        return torch.ones(z.shape[-1], dtype=power.dtype)
+    weight = torch.where(power > 2 * sd, power, 0.0).clamp(min=0).sqrt().repeat_interleave(part)
+    return weight / weight.square().mean().sqrt().clamp(min=1e-300)
+
+
 def best_slope(z: Tensor) -> tuple[float, float]:
     """Slope of the phase of demodulated rows `(row, block)`, cycles over the record, and the tone's energy, nats."""
     energy = _energy(z).sum(0)
@@ -210,6 +225,7 @@ def _of_tone(comparison: Comparison, f: float, others: tuple[float, ...]) -> lis
     z = demodulated(
         whitened(without_lines(comparison.recording, others), comparison.base) if others else comparison.white, f
     )
+    z = z * _course(z)
     length = comparison.n_samples // BLOCKS * BLOCKS
     found = _reference(comparison, f, float(_energy(z).amax()))
     if found is None and len(z) < 2:
