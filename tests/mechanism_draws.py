@@ -49,6 +49,7 @@ from gyrofuse.mismatch.mechanisms.spectra.wandering_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.values.angle_quantization import AngleQuantization
 from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
+from gyrofuse.mismatch.mechanisms.values.interleaving import Interleaving
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.values.stuck_samples import StuckSamples
 from gyrofuse.mismatch.mechanisms.values.unit_scale import UnitScale
@@ -196,6 +197,12 @@ def _(setting: Setting) -> Drawn:
     return Drawn(
         ScaleFactor("rate", error[:, None]), setting.of_each("error", 1e6 * error), {"rate": motion.reshape(1, -1)}
     )
+
+
+@draws(Interleaving)
+def _(setting: Setting) -> Drawn:
+    offset = setting.signed(0.15, 0.25) * setting.size
+    return Drawn(Interleaving(offset), setting.of_each("offset", offset))
 
 
 @draws(ChannelCoupling)

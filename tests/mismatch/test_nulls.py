@@ -425,12 +425,12 @@ def test_faint_lines_that_both_sides_have_are_no_difference():
     n, g = 16_384, torch.Generator().manual_seed(5)
     t = torch.arange(n, dtype=torch.float64)
     seen = 0
-    for _ in range(12):
+    for _ in range(40):
         both = []
         for _ in range(2):
             turn = 2 * math.pi * float(torch.rand((), generator=g))
-            faint = 0.055 * torch.sin(2 * math.pi * 0.19 * t + turn)
+            faint = 0.036 * torch.sin(2 * math.pi * 0.19 * t + turn)
             both.append(torch.randn(3, n, generator=g, dtype=torch.float64) + faint)
         comparison = Comparison.of(RecordingInfo(200.0, "deg/s", ("1", "2", "3")), both[0], both[1][None])
         seen += comparison.line.p_value < 0.01
-    assert seen <= 1
+    assert seen <= 2

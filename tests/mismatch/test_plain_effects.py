@@ -96,6 +96,10 @@ def glitches_of_three(seed: int) -> np.ndarray:
     return x
 
 
+def converters_in_turns(seed: int) -> np.ndarray:
+    return noise(seed) + np.array([[0.0], [0.2], [-0.3]]) * (-1.0) ** np.arange(N)
+
+
 def one_way(seed: int) -> np.ndarray:
     x = noise(seed)
     x[1] += 0.25 * x[0]
@@ -128,6 +132,9 @@ CASES = {
     ),
     "shocks": Case(shocks, ("pulses",), {"pulses.width": 20 / RATE}),
     "glitches of three": Case(glitches_of_three, ("pulses",), {}),
+    "converters in turns": Case(
+        converters_in_turns, ("interleaving",), {"interleaving.offset[1]": 0.2, "interleaving.offset[2]": -0.3}
+    ),
     "one way": Case(one_way, ("cross_talk",), {"cross_talk.part_of_1[1]": 0.25}),
 }
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from gyrofuse._base.results import readable
 from gyrofuse.mismatch.detectors.lines.clocks import clock_test
+from gyrofuse.mismatch.detectors.lines.interleaving import interleaving_test
 from gyrofuse.mismatch.detectors.lines.moving_lines import moving_line_test
 from gyrofuse.mismatch.detectors.lines.ring_downs import ring_down_test
 from gyrofuse.mismatch.detectors.result import TestResult
@@ -29,6 +30,7 @@ TESTS: tuple[Callable[[Comparison], TestResult], ...] = (
     outliers_test,
     channel_test,
     line_test,
+    interleaving_test,
     moving_line_test,
     clock_test,
     ring_down_test,

@@ -46,6 +46,7 @@ from gyrofuse.mismatch.mechanisms.spectra.wandering_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.values.angle_quantization import AngleQuantization
 from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
+from gyrofuse.mismatch.mechanisms.values.interleaving import Interleaving
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.values.stuck_samples import StuckSamples
 from gyrofuse.mismatch.mechanisms.values.unit_scale import UnitScale
@@ -63,7 +64,7 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (GSensitivity, QuadraticCoupling, ScaleFactor, ChannelCoupling, ChannelTransfer),
     (Chirp,),  # which passes any frequency
     (RingDown, Pulses),  # whose strongest are lines too
-    (VibrationTone, ToneInSpells, ToneSize),
+    (VibrationTone, ToneInSpells, ToneSize, Interleaving),
     (RandomTelegraph,),
     (GradualChange,),  # where noise is louder, what is slow is known less well
     (TemperatureDrift, WarmUpTransient, Ramp, Step, BiasOscillation),

@@ -353,12 +353,8 @@ class Finding:
         name = clean_name(before.info.sensors[sensor])
         for ax, comparison, when in zip(axes, (before, after), ("before", "after"), strict=True):
             self.effect.plot(comparison, ax, sensor=sensor, fitted=when == "before")
-            ax.set_title(
-                f"{readable(self.mechanism)}, sensor {name}, {when} the repair",
-                loc="left",
-                fontsize=9,
-                parse_math=False,
-            )
+            title = f"{readable(self.mechanism)}, sensor {name}, {when} the repair"
+            ax.set_title(title, loc="left", fontsize=9, parse_math=False)
         low, high = zip(*(ax.get_ylim() for ax in axes), strict=True)
         for ax in axes:  # so that what is gone shows at a glance
             ax.set_ylim(min(low), max(high))

@@ -34,6 +34,7 @@ _MECHANISMS: dict[str, Callable[[Bench, float], Part]] = {
     "tone_in_spells": shapes.tone_in_spells,
     "ring_down": shapes.ring_down,
     "pulses": shapes.pulses,
+    "interleaving": shapes.interleaving,
     "chirp": strange.chirp,
     "drifting_tone": shapes.drifting_tone,
     "resonance": spectral.resonance,

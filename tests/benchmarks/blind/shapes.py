@@ -134,6 +134,17 @@ def pulses(bench: Bench, nats: float) -> Part:
     return replace(part, parameters={"width": quantity(width, "s")})
 
 
+def interleaving(bench: Bench, nats: float) -> Part:
+    """Two converters take turns, and their zeros differ."""
+    sensors = bench.some_sensors(1)
+    gains = bench.gains(sensors)
+    unit = gains[:, None] * (1.0 - 2.0 * (np.arange(bench.n) % 2))
+    part, size = bench.shape("interleaving", nats, unit, frequency_hz=bench.rate / 2, look_alikes=("vibration_tone",))
+    offset = size * gains[list(sensors)]
+    part.parameters.update(offset=quantity(rms(offset), "deg/s", offset))
+    return part
+
+
 def drifting_tone(bench: Bench, nats: float) -> Part:
     """A rotor whose speed wanders by many line widths.
 

@@ -64,11 +64,15 @@ def moving_line_test(comparison: Comparison) -> TestResult:
     if p_value >= straight.p_value:
         return replace(straight, p_value=both)
     path, rate = moving_line(comparison.observed).path, comparison.info.rate
-    low, high = float(path.nan_to_num(nan=1.0).min()), float(path.nan_to_num(nan=0.0).max())
+    there = path[path.isfinite()]
+    if not len(there):
+        return replace(straight, p_value=both)
+    low, high = float(there.min()), float(there.max())
+    moves = f"that moves between {low * rate:.4g} Hz and {high * rate:.4g} Hz"
     return TestResult(
         "sweep",
         both,
-        f"a line that moves between {low * rate:.4g} Hz and {high * rate:.4g} Hz in some of the sensors",
+        f"a line {moves if low < high else f'near {low * rate:.4g} Hz that comes and goes'} in some of the sensors",
         sensors=straight.sensors,
         levels=tuple(sorted({level_of(max(f, 1 / comparison.n_samples)) for f in (low, high)})),
     )

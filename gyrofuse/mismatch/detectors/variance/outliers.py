@@ -42,7 +42,8 @@ def outliers_test(comparison: Comparison) -> TestResult:
     at = int(z[worst].argmax())
     count = int((z[worst] > 5).sum())
     name = comparison.info.sensors[worst]
-    words = f"{count} samples beyond 5 sd in sensor {name}, the largest {float(z[worst, at]):.3g} sd"
+    what = f"{count} samples beyond 5 sd" if count else "more samples far out than the simulation has"
+    words = f"{what} in sensor {name}, the largest {float(z[worst, at]):.3g} sd"
     sensors: tuple[int, ...] = (worst,)
     if sidak(float(p_values.min()), len(p_values)) > p_value and (many := likely_outliers(comparison)) is not None:
         sensors = tuple((many.sensors > 0.5).nonzero()[:, 0].tolist()) or sensors

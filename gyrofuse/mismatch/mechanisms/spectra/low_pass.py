@@ -82,7 +82,9 @@ class LowPassFilter(Filter):
                 parameters[f"corner[{i}]"] = Parameter(float(corner[i]), float(lowest[i]), float(highest[i]), "Hz")
         where = comparison.info.named(sensors, "all sensors")
         inside = [float(corner[i]) for i in sensors if float(corner[i]) <= rate / 2]
-        corners = f"half power at {min(inside):.4g} Hz" if inside else "half power above half the sampling rate"
+        corners = "more than half of the power still passes at half the rate"
+        if inside:
+            corners = f"half power at {min(inside):.4g} Hz"
         if inside and max(inside) > 1.02 * min(inside):
             corners = f"half power between {min(inside):.4g} and {max(inside):.4g} Hz"
         return found(
