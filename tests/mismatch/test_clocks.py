@@ -7,7 +7,8 @@ import sys
 
 import pytest
 import torch
-from scipy import stats
+from mismatch_draws import normal
+from scipy import signal, stats
 
 import gyrofuse as gf
 from gyrofuse.mismatch.detectors.lines.clocks import BLOCKS, best_slope, clock_test, demodulated, strongest_slip
@@ -221,3 +222,18 @@ def test_what_rings_tells_no_time():
     gain = torch.tensor([0.5, 0.3], dtype=torch.complex128)
     rung = Resonance(Mode(TONE, 1.5 / N, gain, True)).repair(given, g)
     assert clock_test(rung).p_value > 1e-3
+
+
+@pytest.mark.parametrize("wanders", [1e-5, 5e-6])
+def test_a_tone_that_wanders_in_all_sensors_alike_slips_in_none(wanders: float):
+    """The mains' frequency wanders by some mHz: phases of their own, and one course for all."""
+    n, rate, g = 32_768, 1000.0, torch.Generator().manual_seed(3)
+    wander = torch.from_numpy(signal.lfilter([1.0], [1, -math.exp(-1 / 20_000)], normal(n, g=g).numpy()))
+    phase = 2 * math.pi * torch.cumsum(0.05 + wanders * wander / wander.std(), 0)
+    turns = 2 * math.pi * torch.rand(3, 1, generator=g, dtype=torch.float64)
+    given = Comparison.of(
+        RecordingInfo(rate, "deg/s", ("1", "2", "3")),
+        normal(3, n, g=g) + 0.8 * (phase + turns).sin(),
+        normal(1, 3, n, g=g),
+    )
+    assert clock_test(given).p_value > 1e-3

@@ -210,6 +210,29 @@ def _course(z: Tensor) -> Tensor:
     return weight / weight.square().mean().sqrt().clamp(min=1e-300)
 
 
+def _back_from_wander(z: Tensor) -> Tensor:
+    """What turns blocks of rows `(row, block)` back by the phase that all rows wander through; ones where none does.
+
+    All sensors are nearer to one phase then, each by itself: where one of them slips, what it shares with the others is
+    half of its slip, and the others are farther off.
+    """
+    near = 9  # blocks of a phase
+    turn = torch.ones_like(z[0])
+    power, straight = _power_and_energy(z)
+    loud = power > power.max() / 20
+    if int(loud.sum()) < 2:
+        return turn
+    for _ in range(2):  # the phases of the sensors and that of the blocks in turns
+        own = (z * turn).sum(-1, keepdim=True)
+        common = (z * own.conj() / own.abs().clamp(min=1e-300))[loud].sum(0)
+        both = torch.stack([common.real, common.imag])
+        smooth = torch.nn.functional.avg_pool1d(both, near, 1, near // 2, count_include_pad=False)
+        turn = torch.polar(torch.ones_like(smooth[0]), -torch.atan2(smooth[1], smooth[0]))
+    gained = (z * turn).sum(-1).abs().square() / BLOCKS - straight
+    by_chance = BLOCKS / near / 2 / int(loud.sum())  # nats that as many phases gain
+    return turn if bool((gained > 2 * by_chance + NATS_AS_GOOD)[loud].all()) else torch.ones_like(turn)
+
+
 def best_slope(z: Tensor) -> tuple[float, float]:
     """Slope of the phase of demodulated rows `(row, block)`, cycles over the record, and the tone's energy, nats."""
     energy = _energy(z).sum(0)
@@ -226,6 +249,7 @@ def _of_tone(comparison: Comparison, f: float, others: tuple[float, ...]) -> lis
         whitened(without_lines(comparison.recording, others), comparison.base) if others else comparison.white, f
     )
     z = z * _course(z)
+    z = z * _back_from_wander(z)
     length = comparison.n_samples // BLOCKS * BLOCKS
     found = _reference(comparison, f, float(_energy(z).amax()))
     if found is None and len(z) < 2:
