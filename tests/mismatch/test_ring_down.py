@@ -126,6 +126,16 @@ def test_knocks_are_found_and_measured(frequency: float, tau: float):
     assert found.parameters["rate"].high * hours == pytest.approx(7.2247, abs=1e-3)
 
 
+def test_a_very_loud_knock_is_one_too():
+    """Over the level that it makes itself it hardly dies away."""
+    knock = of_nats(struck(3000.0, 0.107, 140.0), 2e5) * torch.tensor([[1.0], [0.0], [0.0]], dtype=torch.float64)
+    found = RingDown.detect_and_fit(compared(knock, 4), 1e-3)
+    assert found is not None
+    assert isinstance(found.effect, RingDown)
+    assert abs(found.parameters["frequency"].value / RATE - 0.107) < 1e-4
+    assert len(found.effect.knocks) == 1
+
+
 def test_modes_that_set_in_together_are_one_knock():
     path = struck(3000.0, 0.11, 40.0) + 0.8 * struck(3000.0, 0.27, 40.0)
     found = RingDown.detect_and_fit(compared(of_nats(path, 500.0), 3), 1e-3)

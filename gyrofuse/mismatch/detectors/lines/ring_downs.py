@@ -86,13 +86,39 @@ def _simulated(comparison: Comparison) -> RingScan:
 
 def scanned_ring_downs(white: Tensor) -> RingScan:
     """All ring-downs of whitened samples `(sensor, time)`, without what is as strong in them run backwards."""
-    found = _scanned(white)
-    return found if found.p_value > CHANCE else irreversible(found, _scanned(white.flip(-1)), white.shape[-1])
+    clip, n = 4.5, white.shape[-1]  # standard deviations: no spike rings
+    level = (white / local_level(white).sqrt()).clamp(-clip, clip)
+    found = _scanned(level)
+    if found.p_value > CHANCE:
+        return found
+    kept = irreversible(found, _scanned(level.flip(-1)), n)
+    if kept.p_value <= CHANCE:
+        return kept
+    # A loud one is a level of its own, over which it does not die away.
+    loud = tuple(cell for cell in found.cells if _dies_away(white, cell))
+    if not loud:
+        return kept
+    total = torch.tensor([cell.log_ratio for cell in loud], dtype=torch.float64).logsumexp(0)
+    return RingScan(float(total) - math.log(found.n_cells), found.n_cells, loud)
+
+
+def _dies_away(white: Tensor, cell: RingCell) -> bool:
+    """Whether a cell is loud in whitened samples `(sensor, time)`, and rises much faster than it falls."""
+    least, share, reach = 5.0, 0.25, 2 * cell.tau  # sd of its amplitude; of the energy that may come first; samples
+    first, end = max(cell.onset - 4 * cell.tau, 0), min(cell.onset + cell.length + 4 * cell.tau, white.shape[-1])
+    t = torch.arange(end - first, dtype=torch.float64)
+    turned = white[int(cell.score.argmax()), first:end] * torch.polar(
+        torch.ones_like(t), -2 * math.pi * cell.frequency * t
+    )
+    width = max(round(1 / cell.frequency), cell.tau // 8) // 2 * 2 + 1
+    both = torch.nn.functional.avg_pool1d(torch.view_as_real(turned).mT, width, 1, width // 2)
+    power = both.square().sum(0)
+    peak = int(power.argmax())
+    before, after = power[max(peak - reach, 0) : peak].sum(), power[peak : peak + reach].sum()
+    return 2 * math.sqrt(float(power[peak])) > least and float(before) < share * float(after)
 
 
 def _scanned(white: Tensor) -> RingScan:
-    clip = 4.5  # standard deviations: no spike rings
-    white = (white / local_level(white).sqrt()).clamp(-clip, clip)
     white = white.to(torch.float32)  # enough to find a place; numbers are fitted to the samples as they are
     n, total, n_cells, found = white.shape[-1], -math.inf, 0, list[RingCell]()
     tau, windows = 8, 96  # a shorter one is a spike; medians over time take a hundred windows
