@@ -20,6 +20,7 @@ from gyrofuse.mismatch.mechanisms.coherence_remainder import CoherenceRemainder
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.mechanisms.regimes.chirp import Chirp
 from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
+from gyrofuse.mismatch.mechanisms.regimes.pulses import Pulses
 from gyrofuse.mismatch.mechanisms.regimes.ring_down import RingDown
 from gyrofuse.mismatch.mechanisms.regimes.scale_mixture import ScaleMixture
 from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
@@ -27,6 +28,7 @@ from gyrofuse.mismatch.mechanisms.regimes.telegraph import RandomTelegraph
 from gyrofuse.mismatch.mechanisms.regimes.tone_in_spells import ToneInSpells
 from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
 from gyrofuse.mismatch.mechanisms.remainder import Remainder
+from gyrofuse.mismatch.mechanisms.signals.channel_coupling import ChannelCoupling
 from gyrofuse.mismatch.mechanisms.signals.channel_transfer import ChannelTransfer
 from gyrofuse.mismatch.mechanisms.signals.clock import ClockSkew
 from gyrofuse.mismatch.mechanisms.signals.g_sensitivity import GSensitivity
@@ -34,6 +36,7 @@ from gyrofuse.mismatch.mechanisms.signals.quadratic_coupling import QuadraticCou
 from gyrofuse.mismatch.mechanisms.signals.scale_factor import ScaleFactor
 from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
 from gyrofuse.mismatch.mechanisms.signals.tone_amplitude import ToneSize
+from gyrofuse.mismatch.mechanisms.slow.bias_oscillation import BiasOscillation
 from gyrofuse.mismatch.mechanisms.slow.ramp import Ramp
 from gyrofuse.mismatch.mechanisms.slow.slow_remainder import SlowRemainder
 from gyrofuse.mismatch.mechanisms.slow.step import Step
@@ -51,6 +54,7 @@ from gyrofuse.mismatch.mechanisms.spectra.wandering_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.values.angle_quantization import AngleQuantization
 from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
+from gyrofuse.mismatch.mechanisms.values.interleaving import Interleaving
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.values.stuck_samples import StuckSamples
 from gyrofuse.mismatch.mechanisms.values.unit_scale import UnitScale
@@ -96,6 +100,16 @@ EVERY = (
         torch.tensor([[0.1, 0.0], [1 / 7, 0.2]], dtype=torch.float64),
         4.0,
     ),
+    Pulses(
+        numbers(1.5, 1 / 3),
+        numbers(0.3, 0.2),
+        numbers(1.0, 1 / 3),
+        torch.tensor([[1 / 3, 0.0], [0.1, 0.2]], dtype=torch.float64),
+        4.0,
+    ),
+    Interleaving(numbers(1 / 3, 0.0)),
+    ChannelCoupling("motor", torch.tensor([[1 / 3], [0.0]], dtype=torch.float64)),
+    BiasOscillation(numbers(1 / 3, 0.0), torch.zeros(2, 4, dtype=torch.float64), numbers(0.2, 0.0), 20 / 3),
     Chirp(
         numbers(0.5, 20 / 3),
         numbers(4.5, 9.0),
@@ -163,7 +177,7 @@ class Odd(Mechanism):
         return (self.channel,)
 
 
-CHANNELS = {"acceleration": 3, "rate": 1, "temperature": 1}  # rows
+CHANNELS = {"acceleration": 3, "rate": 1, "temperature": 1, "motor": 1}  # rows
 ODD: tuple[Any, ...] = (None, True, "x", "nan", "inf", -1, 0, 1e308, -1e308, 10**400, [], {}, [[]], ["a"], [1] * 50)
 
 

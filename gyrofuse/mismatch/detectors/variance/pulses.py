@@ -71,14 +71,15 @@ def scanned_pulses(white: Tensor) -> RingScan:
     scale, widths = 1, [2, 3, 4, 6]
     while 6 * fewest <= white.shape[-1]:
         for width in widths:
-            z = _over_median(_seen(white, width), width)  # (sensor, place)
-            n_cells += z.shape[-1]
-            places = (z.square().amax(0) > 2 * NATS_AS_GOOD).nonzero()[:, 0]
+            ends = 2 * width  # where a filter lets in what is not there
+            score = _over_median(_seen(white, width), width)[:, ends:-ends].square() / 2  # (sensor, place)
+            n_cells += score.shape[-1]
+            places = (score.amax(0) > NATS_AS_GOOD).nonzero()[:, 0]
             if not len(places):
                 continue
-            log_ratios = _log_ratios(z[:, places].square() / 2)
+            log_ratios = _log_ratios(score[:, places])
             total = float(torch.logaddexp(log_ratios.logsumexp(0), torch.tensor(total, dtype=torch.float64)))
-            found += _likeliest(log_ratios, z[:, places].square() / 2, places, scale, width)
+            found += _likeliest(log_ratios, score[:, places], places + ends, scale, width)
         n = white.shape[-1] // 2 * 2
         white, scale, widths = white[:, :n].unflatten(-1, (-1, 2)).sum(-1) / math.sqrt(2), 2 * scale, [4, 6]
     found.sort(key=lambda cell: -cell.log_ratio)
