@@ -45,7 +45,9 @@ def log_factors(scan: Scan) -> Tensor:
     Without the effect the noise that fits best is stronger, which leaves less of the effect than noise held at the fit.
     """
     which = list(scan.sensors)
-    return scan.fit.log_factors + 2 * max(float((scan.held[which].norm() / scan.z[which].norm()).log()), 0.0)
+    held, left = scan.held[which].norm(), scan.z[which].norm()
+    least = 1e-6 * held.clamp(min=1e-300)  # of what stronger noise explains as well there may be nothing left
+    return scan.fit.log_factors + 2 * max(float((held / left.clamp(min=least)).log()), 0.0)
 
 
 def quantiles(points: Tensor, weight: Tensor) -> tuple[float, float, float]:
