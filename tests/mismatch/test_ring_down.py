@@ -13,7 +13,8 @@ from scipy import signal
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse.mismatch.detectors.lines.ring_downs import p_value_beside, ring_down_test, scanned_ring_downs
+from gyrofuse.mismatch.detectors.lines.ring_cells import p_value_beside
+from gyrofuse.mismatch.detectors.lines.ring_downs import ring_down_test, scanned_ring_downs
 from gyrofuse.mismatch.likelihoods.damped_tone import DampedTone, Surroundings
 from gyrofuse.mismatch.mechanisms.regimes.ring_down import RingDown
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.decisions import NATS_AS_GOOD
+from gyrofuse.mismatch.stats.multiplicity import p_value_beyond_largest, p_value_beyond_reference
 
 
 class RingCell(NamedTuple):
@@ -35,6 +36,11 @@ class RingCell(NamedTuple):
     log_ratio: float
     score: Tensor
 
+    @property
+    def sensors(self) -> tuple[int, ...]:
+        """Positions of those in which it stands out, by a quarter of the most at least."""
+        return tuple((self.score > max(NATS_AS_GOOD, float(self.score.max()) / 4)).nonzero()[:, 0].tolist())
+
 
 class RingScan(NamedTuple):
     """The mean likelihood ratio of all cells, and those that stand out, the likeliest first.
@@ -53,6 +59,15 @@ class RingScan(NamedTuple):
     def p_value(self) -> float:
         """Ville's bound: medians of frequencies are known to some tenths, and spend what it has to spare."""
         return math.exp(min(-self.log_ratio, 0.0))
+
+
+def p_value_beside(own: RingScan, simulated: RingScan) -> float:
+    """p value of a scan of the recording beside one of the simulation, which may ring itself."""
+    strongest = torch.tensor([cell.log_ratio for cell in simulated.cells], dtype=torch.float64)
+    largest = max((cell.log_ratio for cell in own.cells), default=0.0)
+    times_as_many = own.n_cells / max(simulated.n_cells, 1)
+    beyond_all = p_value_beyond_reference(own.p_value, simulated.p_value)
+    return max(beyond_all, p_value_beyond_largest(largest, strongest, times_as_many))
 
 
 def apart(cells: list[RingCell]) -> Iterator[RingCell]:

@@ -25,17 +25,13 @@ from torch import Tensor
 
 from gyrofuse._base.transforms import squared_modulus
 from gyrofuse.mismatch.decisions import CHANCE, NATS_AS_GOOD
-from gyrofuse.mismatch.detectors.lines.ring_cells import RingCell, RingScan, apart, irreversible
+from gyrofuse.mismatch.detectors.lines.ring_cells import RingCell, RingScan, apart, irreversible, p_value_beside
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.stats.level_scan import local_level, octave_level, octaves
-from gyrofuse.mismatch.stats.multiplicity import (
-    e_value_of_some,
-    p_value_beyond_largest,
-    p_value_beyond_reference,
-)
+from gyrofuse.mismatch.stats.multiplicity import e_value_of_some
 
 
 def ring_down_test(comparison: Comparison) -> TestResult:
@@ -44,8 +40,7 @@ def ring_down_test(comparison: Comparison) -> TestResult:
     if not found.cells:
         return TestResult("ring", 1.0, "nothing rings")
     cell = found.cells[0]
-    sensors = tuple((cell.score > max(NATS_AS_GOOD, float(cell.score.max()) / 4)).nonzero()[:, 0].tolist())
-    f = cell.frequency * info.rate
+    sensors, f = cell.sensors, cell.frequency * info.rate
     return TestResult(
         "ring",
         ring_down_p_value(comparison),
@@ -68,15 +63,6 @@ def ring_down_p_value(comparison: Comparison) -> float:
     """p value of the recording's, by Ville's bound and beside the strongest cells of the simulation."""
     own = ring_downs(comparison)
     return own.p_value if own.p_value > CHANCE else p_value_beside(own, _simulated(comparison))
-
-
-def p_value_beside(own: RingScan, simulated: RingScan) -> float:
-    """p value of a scan of the recording beside one of the simulation, which may ring itself."""
-    strongest = torch.tensor([cell.log_ratio for cell in simulated.cells], dtype=torch.float64)
-    largest = max((cell.log_ratio for cell in own.cells), default=0.0)
-    times_as_many = own.n_cells / max(simulated.n_cells, 1)
-    beyond_all = p_value_beyond_reference(own.p_value, simulated.p_value)
-    return max(beyond_all, p_value_beyond_largest(largest, strongest, times_as_many))
 
 
 @derived

@@ -18,8 +18,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.decisions import CHANCE, NATS_AS_GOOD
-from gyrofuse.mismatch.detectors.lines.ring_cells import RingCell, RingScan, apart
-from gyrofuse.mismatch.detectors.lines.ring_downs import p_value_beside
+from gyrofuse.mismatch.detectors.lines.ring_cells import RingCell, RingScan, apart, p_value_beside
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.signals.comparison import Comparison
@@ -34,13 +33,12 @@ def pulse_test(comparison: Comparison) -> TestResult:
     if not found.cells:
         return TestResult("pulse", 1.0, "nothing pushes a sensor for a few samples")
     cell = found.cells[0]
-    sensors = tuple((cell.score > max(NATS_AS_GOOD, float(cell.score.max()) / 4)).nonzero()[:, 0].tolist())
     return TestResult(
         "pulse",
         pulse_p_value(comparison),
         f"a pulse of {cell.length / info.rate:.3g} s at {cell.onset / info.rate:.6g} s in "
-        f"{info.named(sensors, 'all sensors')}",
-        sensors=sensors,
+        f"{info.named(cell.sensors, 'all sensors')}",
+        sensors=cell.sensors,
         levels=(level_of(cell.frequency),),
         time_s=cell.onset / info.rate,
     )

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import torch
-from scipy import stats
 from torch import Tensor
 
 from gyrofuse.mismatch.decisions import NATS_AS_GOOD, NATS_PER_NUMBER
@@ -19,7 +18,7 @@ from gyrofuse.mismatch.likelihoods.damped_tone import Surroundings
 from gyrofuse.mismatch.likelihoods.pulse import FittedPulse, Pulse, fitted_pulse, other_course, sized, width_limits
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
-from gyrofuse.mismatch.mechanisms.regimes.transient import Transient
+from gyrofuse.mismatch.mechanisms.regimes.transient import Transient, hourly
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.signals.folds import N_FOLDS
@@ -66,11 +65,10 @@ class Pulses(Transient):
         info, rate = comparison.info, comparison.info.rate
         effect, strongest = cls.of(pulses, comparison), pulses[0]
         around = _around(comparison, comparison.recording, strongest.pulse)
-        width, hours = strongest.pulse.width / rate, effect.duration_s / 3600
-        fewest, most = (stats.chi2.ppf(q, 2 * (len(pulses) + more)) / 2 for q, more in ((0.025, 0), (0.975, 1)))
+        width, often = strongest.pulse.width / rate, hourly(len(pulses), effect.duration_s)
         shortest, longest = width_limits(around, strongest)
         parameters = {
-            "rate": Parameter(len(pulses) / hours, float(fewest) / hours, float(most) / hours, "1/h"),
+            "rate": often,
             "width": Parameter(width, shortest / rate, longest / rate, "s"),
         }
         for i in strongest.amplitude.nonzero()[:, 0].tolist():
@@ -82,7 +80,7 @@ class Pulses(Transient):
         return Finding(
             cls.name,
             effect,
-            f"{many} of one sign and then gone, {len(pulses) / hours:.3g} an hour, in "
+            f"{many} of one sign and then gone, {often.value:.3g} an hour, in "
             f"{info.named(concerned, 'all sensors')}: the strongest at {onset:.6g} s, {width:.3g} s long, of "
             f"{float(strongest.amplitude[largest]):.3g} {info.measure} in sensor {info.sensors[largest]}, as of "
             "a shock or a fault of transmission",

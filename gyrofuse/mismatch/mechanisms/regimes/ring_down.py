@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import torch
-from scipy import stats
 from torch import Tensor
 
 from gyrofuse.mismatch.decisions import NATS_AS_GOOD, NATS_PER_NUMBER
@@ -18,7 +17,7 @@ from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.likelihoods.damped_tone import DampedTone, FittedTone, Surroundings
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
-from gyrofuse.mismatch.mechanisms.regimes.transient import Transient
+from gyrofuse.mismatch.mechanisms.regimes.transient import Transient, hourly
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.signals.folds import N_FOLDS
@@ -92,10 +91,10 @@ class RingDown(Transient):
         there = tuple((strongest.size != 0).any(0).nonzero()[:, 0].tolist())
         f, decay = strongest.tone.frequency * info.rate, strongest.tone.tau / info.rate
         spread, factor = Z * frequency_sd * info.rate, math.exp(min(Z * decay_sd, 20.0))
-        knocks, hours = len(effect.knocks), effect.duration_s / 3600
-        low, high = (stats.chi2.ppf(q, 2 * (knocks + more)) / 2 / hours for q, more in ((0.025, 0), (0.975, 1)))
+        knocks = len(effect.knocks)
+        often = hourly(knocks, effect.duration_s)
         parameters = {
-            "rate": Parameter(knocks / hours, float(low), float(high), "1/h"),
+            "rate": often,
             "frequency": Parameter(f, max(f - spread, 0.0), min(f + spread, info.rate / 2), "Hz"),
             "decay_time": Parameter(decay, decay / factor, decay * factor, "s"),
         }
@@ -110,7 +109,7 @@ class RingDown(Transient):
         return Finding(
             cls.name,
             effect,
-            f"{knocks} {'knock' if knocks == 1 else 'knocks'} after which something rings, {knocks / hours:.3g} an "
+            f"{knocks} {'knock' if knocks == 1 else 'knocks'} after which something rings, {often.value:.3g} an "
             f"hour, in {info.named(concerned, 'all sensors')}: the strongest at {onset:.6g} s, at {f:.4g} Hz, dies "
             f"away in {decay:.3g} s, from {float(amplitude[largest]):.3g} {info.measure} in sensor "
             f"{info.sensors[largest]}",

@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import ClassVar
 
 import torch
+from scipy import stats
 from torch import Tensor
 
 from gyrofuse.mismatch.likelihoods.noise_near import noise_along
-from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
+from gyrofuse.mismatch.mechanisms.mechanism import Mechanism, Parameter
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED
 from gyrofuse.mismatch.signals.lines import whitened
@@ -54,6 +55,13 @@ class Transient(Mechanism):
     def apply_elsewhere(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
         """It comes at other times there."""
         return self.apply_to_reference(comparison, generator)
+
+
+def hourly(count: int, duration_s: float) -> Parameter:
+    """Events an hour with 95 % limits, of as many in so many seconds (Poisson)."""
+    hours = duration_s / 3600
+    low, high = (float(stats.chi2.ppf(q, 2 * (count + more))) / 2 / hours for q, more in ((0.025, 0), (0.975, 1)))
+    return Parameter(count / hours, low, high, "1/h")
 
 
 def kept_of(n_samples: int, fold: int) -> Tensor:
