@@ -16,7 +16,7 @@ from gyrofuse.mismatch.detectors.slow.channels import ChannelFit, regress
 from gyrofuse.mismatch.detectors.slow.transfer import Transfer, likeliest_transfer
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.mechanisms import pictures
-from gyrofuse.mismatch.mechanisms.channel_path import ChannelPath
+from gyrofuse.mismatch.mechanisms.known_path import KnownPath
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
 from gyrofuse.mismatch.mechanisms.not_identifiable import NOT_IDENTIFIABLE
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
@@ -37,7 +37,7 @@ _SCATTER = 3.0  # standard deviations of what is so by chance
 
 
 @dataclass(frozen=True, eq=False)
-class ChannelGain(ChannelPath):
+class ChannelGain(KnownPath):
     """`x_i(t) = sum_k coupling_ik (m * a_k)(t)` with rows `a` made from an auxiliary channel.
 
     The response `m`, which all sensors share, is one for a plain gain; see `Transfer`.

@@ -20,7 +20,7 @@ from gyrofuse.mismatch.likelihoods.finite_response import (
     response_at,
 )
 from gyrofuse.mismatch.mechanisms import pictures
-from gyrofuse.mismatch.mechanisms.channel_path import ChannelPath
+from gyrofuse.mismatch.mechanisms.known_path import KnownPath
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.derived import derived
@@ -36,7 +36,7 @@ _SIMPLER = 0.02  # share of the score that more numbers have to add, to response
 
 
 @dataclass(frozen=True, eq=False)
-class ChannelTransfer(ChannelPath):
+class ChannelTransfer(KnownPath):
     """`x_i(t) = sum_k sum_l taps_ikl a_k(t - l)`, `l` from `-L` to `L`, over the rows `a` of auxiliary channels.
 
     A scale factor, a misalignment, a delay and a sensitivity to acceleration are cases of it, which are preferred where

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from gyrofuse.mismatch.detectors.lines.interleaving import alternation, interleaving_p_value
 from gyrofuse.mismatch.mechanisms import pictures
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanisms.known_path import KnownPath
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples, signal_gains
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Interleaving(Mechanism):
+class Interleaving(KnownPath):
     """`x_i(t) = offset_i (-1)^t`: even samples are too high by as much as odd ones are too low.
 
     A line at half the rate looks like it: with samples at one rate nothing tells them apart.
@@ -32,10 +33,7 @@ class Interleaving(Mechanism):
     """
 
     name: ClassVar[str] = "interleaving"
-    likelihood: ClassVar[str] = "known paths"
     separated_by: ClassVar[str] = "a recording at another rate"
-    known_path: ClassVar[bool] = True
-    additive: ClassVar[bool] = True
     offset: OfSensors
 
     @classmethod
@@ -81,22 +79,13 @@ class Interleaving(Mechanism):
         return replace(self, offset=_means(comparison.recording, there, estimation_samples(comparison.n_samples, fold)))
 
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
-        return signal_gains(comparison, self._path(comparison.n_samples), fold)
+        return signal_gains(comparison, self._path(comparison.info, comparison.n_samples), fold)
 
     def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
         rate = comparison.info.rate
         pictures.spectrum_near(ax, comparison, sensor, rate / 2, rate / comparison.n_samples)
 
-    def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
-        return signal + self._path(signal.shape[-1])
-
-    def remove(self, signal: Tensor, info: RecordingInfo) -> Tensor:
-        return signal - self._path(signal.shape[-1])
-
-    def repair(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
-        return comparison.subtract(self._path(comparison.n_samples))
-
-    def _path(self, n_samples: int) -> Tensor:
+    def _path(self, info: RecordingInfo, n_samples: int) -> Tensor:
         return self.offset[:, None] * _turns(n_samples)
 
 

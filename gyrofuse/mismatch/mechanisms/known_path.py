@@ -1,4 +1,4 @@
-"""What follows auxiliary channels: a path that channels determine, on top of what a sensor has of its own."""
+"""A path that is known up to its amplitudes, on top of what a sensor has of its own: of channels, or in turns."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 
 
-class ChannelPath(Mechanism):
-    """`x_i(t) = path_i(t)`, known where the channels are."""
+class KnownPath(Mechanism):
+    """`x_i(t) = path_i(t)`, known where the channels are that it follows."""
 
     likelihood: ClassVar[str] = "known paths"
     known_path: ClassVar[bool] = True
