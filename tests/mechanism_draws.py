@@ -13,6 +13,7 @@ from torch import Tensor
 import gyrofuse as gf
 from gyrofuse.mismatch.likelihoods.spectra.filter_forms import filter_strength
 from gyrofuse.mismatch.mechanisms.coherence_remainder import CoherenceRemainder
+from gyrofuse.mismatch.mechanisms.regimes.channel_noise import ChannelNoise
 from gyrofuse.mismatch.mechanisms.regimes.chirp import Chirp
 from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
 from gyrofuse.mismatch.mechanisms.regimes.pulses import Pulses
@@ -29,9 +30,12 @@ from gyrofuse.mismatch.mechanisms.signals.clock import ClockSkew
 from gyrofuse.mismatch.mechanisms.signals.g_sensitivity import GSensitivity
 from gyrofuse.mismatch.mechanisms.signals.quadratic_coupling import QuadraticCoupling
 from gyrofuse.mismatch.mechanisms.signals.scale_factor import ScaleFactor
+from gyrofuse.mismatch.mechanisms.signals.sensor_delay import SensorDelay
+from gyrofuse.mismatch.mechanisms.signals.time_scale import TimeScale
 from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
 from gyrofuse.mismatch.mechanisms.signals.tone_amplitude import ToneSize
 from gyrofuse.mismatch.mechanisms.slow.bias_oscillation import BiasOscillation
+from gyrofuse.mismatch.mechanisms.slow.late_warm_up import LateWarmUp
 from gyrofuse.mismatch.mechanisms.slow.ramp import Ramp
 from gyrofuse.mismatch.mechanisms.slow.slow_remainder import SlowRemainder
 from gyrofuse.mismatch.mechanisms.slow.step import Step
@@ -51,6 +55,7 @@ from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
 from gyrofuse.mismatch.mechanisms.values.interleaving import Interleaving
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
+from gyrofuse.mismatch.mechanisms.values.sensor_gain import SensorGain
 from gyrofuse.mismatch.mechanisms.values.stuck_samples import StuckSamples
 from gyrofuse.mismatch.mechanisms.values.unit_scale import UnitScale
 from tests.mechanism_settings import RATE, TONE, TONE_SIZE, Drawn, Setting, draws, noise_spectrum
@@ -68,6 +73,12 @@ def acceleration(setting: Setting) -> Tensor:
 def _(setting: Setting) -> Drawn:
     factor = (math.degrees(1), 1000.0, 3600.0)[int(setting.even(0, 3))] ** setting.sign()
     return Drawn(UnitScale(factor), {"factor": factor})
+
+
+@draws(SensorGain)
+def _(setting: Setting) -> Drawn:
+    factor = setting.signed(0.2, 0.4).mul(setting.size).exp()
+    return Drawn(SensorGain(factor), setting.of_each("gain", factor), moved=True)
 
 
 @draws(Quantization)
@@ -148,6 +159,17 @@ def _(setting: Setting) -> Drawn:
     return Drawn(effect, setting.of_each("factor", factor))
 
 
+@draws(ChannelNoise)
+def _(setting: Setting) -> Drawn:
+    held = 60  # samples
+    command = setting.normal(1, setting.n_samples // held + 1).sigmoid().repeat_interleave(held, -1)
+    command = command[:, : setting.n_samples]
+    ends = torch.tensor([0.0, 1.0], dtype=torch.float64)
+    factor = setting.sizes(1.7, 2.2, 1.0) ** min(2 * setting.size, 6.0)
+    effect = ChannelNoise("motor", 0, "level", ends, 0.0, torch.ones_like(factor), factor, setting.even(0.5, 2.0))
+    return Drawn(effect, {}, {"motor": command})
+
+
 @draws(RandomTelegraph)
 def _(setting: Setting) -> Drawn:
     half_step = setting.sizes(0.5, 0.7) * setting.size
@@ -165,10 +187,25 @@ def _(setting: Setting) -> Drawn:
     if setting.chance():
         skew = setting.sign() * setting.even(1.5e-4, 4e-4) * setting.size
         effect = ClockSkew(setting.concerned, skew, (), TONE, none, none)
-        return Drawn(effect, {"skew": 1e6 * skew}, tone=True)
+        return Drawn(effect, {"skew": 1e6 * skew}, tones=(TONE,))
     at, count = int(setting.even(0.3, 0.7) * setting.n_samples), 1 + int(setting.chance())
     effect = ClockSkew(setting.concerned, 0.0, ((at, count),), TONE, none, none)
-    return Drawn(effect, {"lost": count, "time_of_loss_1": at / RATE}, tone=True)
+    return Drawn(effect, {"lost": count, "time_of_loss_1": at / RATE}, tones=(TONE,))
+
+
+@draws(TimeScale)
+def _(setting: Setting) -> Drawn:
+    ratio, lines = 1 + setting.sign() * setting.even(0.02, 0.1), (TONE, 0.31)
+    none = torch.zeros(setting.n_sensors, len(lines), dtype=torch.complex128)
+    f = torch.tensor([0.01, 0.1, 0.4], dtype=torch.float64)
+    effect = TimeScale(ratio, tuple(RATE * f for f in lines), none, f, torch.zeros(setting.n_sensors, len(f)).to(f))
+    return Drawn(effect, {"ratio": ratio, "rate": RATE / ratio}, tones=lines)
+
+
+@draws(SensorDelay)
+def _(setting: Setting) -> Drawn:
+    late = setting.signed(0.5, 0.8) * setting.size
+    return Drawn(SensorDelay(late), setting.of_each("delay", 1e3 / RATE * late), moved=True)
 
 
 @draws(GSensitivity)
@@ -285,7 +322,7 @@ def _(setting: Setting) -> Drawn:
 def _(setting: Setting) -> Drawn:
     change = setting.signed(0.25, 0.4)
     size = (TONE_SIZE + change) * (1 + change.abs() * (setting.size - 1)).abs()
-    return Drawn(ToneSize(TONE * RATE, size), setting.of_each("amplitude", size), tone=True)
+    return Drawn(ToneSize(TONE * RATE, size), setting.of_each("amplitude", size), tones=(TONE,))
 
 
 @draws(Step)
@@ -315,6 +352,16 @@ def _(setting: Setting) -> Drawn:
     slower = (Decay(setting.signed(5.0, 7.0), 3 * tau),) if setting.size > 1 else ()
     effect = WarmUpTransient(size, _none(setting), tau, slower)
     return Drawn(effect, {"time_constant": tau, **setting.of_each("size", size)})
+
+
+@draws(LateWarmUp)
+def _(setting: Setting) -> Drawn:
+    seconds = setting.n_samples / RATE
+    size, onset, tau = setting.signed(5.0, 7.0) * setting.size, setting.even(0.2, 0.6) * seconds, seconds / 16
+    return Drawn(
+        LateWarmUp(size, _none(setting), onset, tau),
+        {"onset": onset, "time_constant": tau, **setting.of_each("size", size)},
+    )
 
 
 @draws(TemperatureDrift)
@@ -424,9 +471,12 @@ def _(setting: Setting) -> Drawn:
 
 @draws(ChannelTransfer)
 def _(setting: Setting) -> Drawn:
-    gain, late = setting.signed(0.015, 0.02) * setting.size, setting.sizes(-1.5, 1.5)
+    # Late and early in turns: of this one gain and one delay of all sensors, which have a name, explain nothing.
+    gain, late = setting.signed(0.015, 0.02) * setting.size, setting.sizes(2, 4)
+    late[1::2] *= -1
     lags = torch.arange(-8, 9, dtype=torch.float64)
-    delayed = torch.sinc(lags - late[:, None]) * torch.hann_window(19, periodic=False, dtype=torch.float64)[1:-1]
+    apart = lags - late[:, None]
+    delayed = torch.sinc(apart) * (math.pi * apart / 12).cos().square() * (apart.abs() < 6)
     motion = gf.AR1(0.9, 400 * (1 - 0.9**2)).simulate(setting.n_samples, generator=setting.generator)
     effect = ChannelTransfer(("rate",), (gain[:, None] * delayed)[:, None])
     truth = setting.of_each("gain", gain) | setting.of_each("delay", 1e3 / RATE * late)

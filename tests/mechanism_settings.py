@@ -15,6 +15,7 @@ from torch import Tensor
 import gyrofuse as gf
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.mechanisms.signals.clock import ClockSkew
+from gyrofuse.mismatch.mechanisms.signals.sensor_delay import SensorDelay
 from gyrofuse.mismatch.repair.inputs import prepared
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum
@@ -33,13 +34,15 @@ class Drawn(NamedTuple):
         effect: It.
         truth: What limits have to cover, by the names of a finding's parameters.
         channels: Auxiliary channels that it follows.
-        tone: Whether it takes a tone that recording and simulation have.
+        tones: That recording and simulation have to have, cycles per sample.
+        moved: Whether one motion has to move all sensors of both.
     """
 
     effect: Mechanism
     truth: dict[str, float]
     channels: Mapping[str, Tensor] = {}
-    tone: bool = False
+    tones: tuple[float, ...] = ()
+    moved: bool = False
 
 
 @dataclass(frozen=True)
@@ -161,23 +164,31 @@ def drawn_in(
     return draw_of(kind)(setting), setting
 
 
-def tone(n_sensors: int, n_samples: int, turn: float) -> Tensor:
+def tone(n_sensors: int, n_samples: int, turn: float, f: float = TONE) -> Tensor:
     """What recording and simulation share, `(sensor, time)`."""
-    angle = 2 * math.pi * TONE * torch.arange(n_samples, dtype=torch.float64) + turn
+    angle = 2 * math.pi * f * torch.arange(n_samples, dtype=torch.float64) + turn
     return TONE_SIZE * angle.cos().expand(n_sensors, -1)
+
+
+def motion(n_samples: int, rng: torch.Generator) -> Tensor:
+    """What moves all sensors, faster and slower, `(time,)`."""
+    return gf.AR1(0.8, 2.0).simulate(n_samples, generator=rng)
 
 
 def concealed(kind: type[Mechanism], *seed: object, n_sensors: int = 2) -> tuple[gf.Recording, gf.Recording, Drawn]:
     """A recording with a mechanism that the simulation does not have, plainly seen in all sensors, or in one clock."""
-    concerned = None if kind is not ClockSkew else (0,)
-    n_sensors = n_sensors if kind is not ClockSkew else max(n_sensors, 3)
+    apart = kind in (ClockSkew, SensorDelay)  # from the others
+    concerned, n_sensors = ((0,), max(n_sensors, 3)) if apart else (None, n_sensors)
     drawn, setting = drawn_in(kind, *seed, n_sensors=n_sensors, concerned=concerned)
     rng = setting.generator
     simulation = array(n_sensors).simulate(RECORDS * N_SAMPLES, generator=rng)
     recording = setting.clean
-    if drawn.tone:
-        recording = recording + tone(n_sensors, N_SAMPLES, setting.even(0, 6))
-        simulation = simulation + tone(n_sensors, RECORDS * N_SAMPLES, setting.even(0, 6))
+    for f in drawn.tones:
+        recording = recording + tone(n_sensors, N_SAMPLES, setting.even(0, 6), f)
+        simulation = simulation + tone(n_sensors, RECORDS * N_SAMPLES, setting.even(0, 6), f)
+    if drawn.moved:
+        recording = recording + motion(N_SAMPLES, rng)
+        simulation = simulation + motion(RECORDS * N_SAMPLES, rng)
     recording = drawn.effect.apply(recording, info(n_sensors, drawn.channels), rng)
     return (
         gf.Recording(recording, RATE, unit="deg/s", channels=drawn.channels),

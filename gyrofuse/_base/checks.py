@@ -159,3 +159,19 @@ def own_generator(generator: torch.Generator | None, device: torch.device | str 
             f"{str(generator.device)!r}; make it with torch.Generator(device={str(wanted)!r})"
         )
     return generator
+
+
+def repeatable_generator(generator: torch.Generator | None) -> torch.Generator:
+    """Return `generator`, or one with a fixed seed, by which what it is for can be repeated.
+
+    Raises:
+        TypeError: It is something else, such as a seed.
+    """
+    if generator is None:
+        return torch.Generator().manual_seed(0)
+    if not isinstance(generator, torch.Generator):
+        raise TypeError(
+            f"`generator`: expected a torch.Generator, got {type(generator).__name__}; make one by "
+            "`torch.Generator().manual_seed(seed)`"
+        )
+    return generator

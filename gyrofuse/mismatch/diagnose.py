@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gyrofuse._base.checks import check_n_samples
+from gyrofuse._base.checks import check_n_samples, repeatable_generator
 from gyrofuse.io.recording import Recording
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.detectors.spectra.fit_verdict import KNOWN, fit_verdict
@@ -88,8 +88,7 @@ def diagnose(
         raise ValueError(f"`false_alarm`: expected a number between 0 and 1 such as 0.01, got {false_alarm!r}")
     if check_n_samples("twins", twins) and twins < FEWEST:
         raise ValueError(f"`twins`: expected 0, or {FEWEST} or more, got {twins}; fewer cannot tell a tail")
-    if generator is None:
-        generator = torch.Generator().manual_seed(0)
+    generator = repeatable_generator(generator)
     level = sidak_level(false_alarm, len(TESTS))  # p value of one test that makes a mismatch of all
     recording, judge = on_processor(recording), on_processor(judge)
     simulation = on_processor(modelled(simulation, recording, fitted_samples))
@@ -150,7 +149,7 @@ def diagnose(
     unexplained = _significant(after, false_alarm)
     hidden = sorted({i for f in findings for i in f.hides})
     for finding in findings:
-        own = tuple(effect.in_unit(finding.effect.unit_factor) for effect in own)
+        own = finding.effect.left_of(own)
     left = repair_leftovers(start, comparison, unexplained, hidden, generator)
     comparison, effects = left.comparison, (*(f.effect for f in findings), *left.effects)
     if hidden:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from gyrofuse._base.checks import check_confidence_level, check_positive_integer
+from gyrofuse._base.checks import check_confidence_level, check_positive_integer, repeatable_generator
 from gyrofuse._base.deprecation import moved_names, renamed_arguments
 from gyrofuse._base.results import ConfidenceInterval, cleaned, listed
 from gyrofuse.navigation.filter import FilterErrors, Gnss, InitialUncertainty, run_filter
@@ -172,7 +172,7 @@ def compare_filters(
                 f"`{name}`: expected one model, or one for each of {n_flights} flights, got parameters of shape "
                 f"{tuple(given.params.shape)}"
             )
-    generator = torch.Generator().manual_seed(0) if generator is None else generator
+    generator = repeatable_generator(generator)
     path, gnss = trajectory or flight(), gnss or Gnss()
     gnss.samples_apart(rate)
     shared = _accelerometer() if accelerometer is None else accelerometer

@@ -220,7 +220,7 @@ def outcome(given: Setting) -> str:
     model = repaired_from_dict(plain["model"])
     n = report.recording.shape[-1]
     drawn = [
-        m.simulate(n, channels=report.case.scene.channels, generator=torch.Generator().manual_seed(1))
+        m.simulate(n, channels=report.case.info.channels, generator=torch.Generator().manual_seed(1))
         for m in (model, report.model)
     ]
     if not bool(drawn[0].isfinite().all()):

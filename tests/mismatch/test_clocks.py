@@ -11,7 +11,8 @@ from mismatch_draws import normal
 from scipy import signal, stats
 
 import gyrofuse as gf
-from gyrofuse.mismatch.detectors.lines.clocks import BLOCKS, best_slope, clock_test, demodulated, strongest_slip
+from gyrofuse.mismatch.detectors.lines.clocks import clock_test, strongest_slip
+from gyrofuse.mismatch.detectors.lines.demodulation import BLOCKS, best_slope, demodulated
 from gyrofuse.mismatch.detectors.spectra.band_tests import line_test
 from gyrofuse.mismatch.mechanisms.signals.clock import ClockSkew
 from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode
@@ -115,6 +116,20 @@ def test_lost_samples_are_counted_and_found_in_time():
             held += entry is not None and entry.low <= at / 100 <= entry.high
     assert right >= 9
     assert stats.binom.cdf(held, 2 * n_runs, 0.95) > 1e-3, f"{held} of {2 * n_runs}"
+
+
+@pytest.mark.parametrize("losses", [{5000: 1}, {4000: 2, 9000: 1}])
+def test_what_all_lose_at_once_is_told_by_the_simulation_s_tone(losses):
+    case = comparison(generator(61), lost(losses, 0, 1, 2, 3), 0.6)
+    slip = strongest_slip(case)
+    assert slip.p_value < 1e-12
+    assert (slip.sensors, [loss.count for loss in slip.losses]) == ((0, 1, 2, 3), list(losses.values()))
+    found = ClockSkew.detect_and_fit(case, LEVEL)
+    assert "against a tone at 18.17 Hz that keeps its phase" in found.sentence
+    assert all(abs(at - true) < 200 for (at, _), true in zip(found.effect.losses, losses, strict=True))
+    after = found.repair(case, generator(1))
+    assert clock_test(after).p_value > LEVEL
+    assert line_test(after).p_value > LEVEL
 
 
 def test_a_slow_tone_tells_as_well(monkeypatch):

@@ -18,6 +18,7 @@ from gyrofuse.mismatch.detectors.spectra.peaks import Stretch
 from gyrofuse.mismatch.detectors.spectra.steadiness import Steadiness, steadiness
 from gyrofuse.mismatch.mechanisms.mechanism import Alternative, Finding, Mechanism, Parameter
 from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone, amplitude_limits, line_near
+from gyrofuse.mismatch.mechanisms.slow.late_warm_up import LateWarmUp
 from gyrofuse.mismatch.mechanisms.slow.step import Step
 from gyrofuse.mismatch.mechanisms.slow.warm_up import WarmUpTransient
 from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
@@ -282,7 +283,7 @@ def test_look_alikes_have_other_names_and_the_same_sensors():
     (link,), _ = chain(comparison, Step)
     rivals = rivals_of(link.finding, comparison)
     assert [rival.name for rival in rivals] == ["warm_up_transient"]
-    assert isinstance(rivals[0], WarmUpTransient)
+    assert isinstance(rivals[0], WarmUpTransient | LateWarmUp)
     assert rivals[0].size.nonzero()[:, 0].tolist() == list(link.finding.sensors)
 
 

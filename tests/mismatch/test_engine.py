@@ -219,6 +219,9 @@ def test_twins_that_all_say_the_same_tell_no_tail():
     assert monte_carlo_p_value(math.exp(-5), some) == pytest.approx(11 / 257 * (1 + 5 / 10) ** -10, rel=1e-6)
 
 
+HALF_RATE = gf.Recording(array(2).signal, rate=RATE / 2)
+
+
 @pytest.mark.parametrize(
     ("recording", "simulation", "options", "message"),
     [
@@ -233,6 +236,14 @@ def test_twins_that_all_say_the_same_tell_no_tail():
         (array(1), MODEL, {"twins": 3}, "`twins`: expected 0, or 50 or more, got 3"),
         (array(1).signal[None].expand(3, -1, -1), MODEL, {}, "one axis at a time"),
         (array(1), MODEL.with_params(MODEL.params.expand(5, -1)), {}, r"parameters \(6,\) for each, got.*\(5,\)"),
+        (array(1), MODEL, {"generator": 0}, r"expected a torch.Generator, got int; make one by `torch.Generator\(\)"),
+        (array(1), array(2).select(sensors=[5, 0, 1, 2, 3, 4]), {}, "expected the sensors in the order 1, 2.*got 6, 1"),
+        (
+            array(1),
+            gf.fit_gmwm(HALF_RATE, "WN"),
+            {},
+            "a fit of records at 100 Hz as of the recording, got one at 50 Hz",
+        ),
         (array(1), gf.WhiteNoise() + gf.AR1(), {}, "expected a number, got a parameter to be estimated"),
     ],
 )

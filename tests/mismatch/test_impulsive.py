@@ -222,7 +222,7 @@ def test_a_limit_is_where_the_likelihood_at_best_is_lower_by_what_95_per_cent_al
     def lowest(rate: float) -> float:
         runs = [
             optimize.minimize(
-                lambda rest: sample.deviance(outliers.law_of([math.log(rate), *rest])),
+                lambda rest: sample.deviance([math.log(rate), *rest])[0],
                 [math.log(law.amplitude), start, 0.0],
                 method="Nelder-Mead",
                 options={"maxiter": 2000},
@@ -233,6 +233,19 @@ def test_a_limit_is_where_the_likelihood_at_best_is_lower_by_what_95_per_cent_al
 
     for limit in law.rate_limits:
         assert lowest(limit) - lowest(law.rate) == pytest.approx(1.92, abs=0.25)  # limits are found to 2 %
+
+
+def test_slopes_of_the_likelihood_of_outliers_are_its_differences() -> None:
+    g = torch.Generator().manual_seed(8)
+    sample = outliers.Sample(normal(4096, g=g) + (even(4096, g=g) < 1e-2) * 5.0)
+    for theta in ([-5.0, 1.5, -1.5, 0.01], [-2.0, 0.3, -0.2, -0.04]):
+        total, slopes = sample.deviance(theta)
+        law = outliers.law_of(theta)
+        beforehand = (math.log(law.spread / law.height / 0.2) / 0.8) ** 2 / 2
+        plain = -float((sample.counts * outliers.mixture(sample.values, law)).sum())
+        assert total == pytest.approx(beforehand + plain, rel=1e-12)
+        expected = optimize.approx_fprime(np.array(theta), lambda point: sample.deviance(point)[0], 1e-6)
+        np.testing.assert_allclose(slopes, expected, rtol=1e-3, atol=1e-3 * np.abs(expected).max())
 
 
 def test_what_is_held_of_the_spread_yields_to_many_outliers() -> None:
@@ -379,3 +392,16 @@ def test_filters_leave_no_outliers(order: int, corner: float):
         signal = torch.from_numpy(lfilter(numerator, denominator, white.numpy())[:, 2000:].copy())
         rare += impulses.spike_p_value(Comparison.of(SCENE, signal, white[None, :, 2000:])) < 0.01
     assert rare <= 1  # 2 of 8 have a probability of 0.003
+
+
+def test_outliers_that_only_the_simulation_has_are_told():
+    g = torch.Generator().manual_seed(7)
+    signal, simulation = (torch.randn(2, 20_000, generator=g, dtype=torch.float64) for _ in range(2))
+    simulation[1, ::400] *= 8.0
+    found = impulses.outliers_test(Comparison.of(SCENE, signal, simulation[None]))
+    assert found.p_value < 1e-6
+    assert found.sensors == (1,)
+    assert found.words == "fewer samples far out than the simulation has in sensor y"
+    for given in (simulation, signal):  # nothing differs, or the recording has them
+        assert impulses.outliers_test(Comparison.of(SCENE, simulation, given[None])).words != found.words
+    assert Spikes.detect_and_fit(Comparison.of(SCENE, signal, simulation[None]), LEVEL) is None

@@ -48,6 +48,26 @@ def test_stretches_make_no_difference(monkeypatch: pytest.MonkeyPatch):
     torch.testing.assert_close((without_lines(signal, frequencies), amplitudes(signal, frequencies)), whole)
 
 
+@pytest.mark.parametrize(("times", "differs"), [(1.0, False), (4.0, True)])
+def test_a_faint_line_of_the_simulation_hides_no_plain_one(times: float, differs: bool):
+    """That stands out among few frequencies and not among all; of the same size on both sides it is no difference."""
+    frequency, nats = 0.1234, 11.0
+    t = torch.arange(N, dtype=torch.float64)
+    line = math.sqrt(4 * nats / (3 * N)) * torch.sin(2 * math.pi * frequency * t)
+
+    def noise(seed: int) -> torch.Tensor:
+        return torch.randn(3, N, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+    recording, simulation = (
+        gf.Recording(noise(seed) + size * line, rate=RATE, unit="deg/s") for seed, size in ((1, times), (2, 1.0))
+    )
+    comparison = prepared(recording, simulation, None, torch.Generator().manual_seed(0))
+    assert simulated_lines(comparison.reference) == ()
+    assert (comparison.line.p_value < 1e-6) == differs
+    if differs:
+        assert comparison.line.frequency == pytest.approx(frequency, abs=1 / N)
+
+
 @pytest.mark.statistical
 @pytest.mark.parametrize("sampled", [False, True])
 def test_a_tone_that_both_have_is_no_mismatch(sampled: bool):

@@ -108,3 +108,23 @@ def test_an_ar1_that_stands_for_a_filter_is_told(order: int, corner: float):
     assert report.judged is not None
     assert report.judged.helps
     assert report.judged.after < report.judged.before / 3
+
+
+@pytest.mark.parametrize("size", [0.8, pytest.param(0.5, marks=pytest.mark.statistical)])
+def test_a_fit_without_the_quantisation_of_an_angle(size: float):
+    """What is left out has made the white noise that was fitted too loud: both are told, and explain all."""
+    truth = gf.WhiteNoise(1.0) + gf.QuantizationNoise(size**2) + gf.RandomWalk(1e-7)
+    g = torch.Generator().manual_seed(5)
+    x, earlier = (truth.simulate(n, batch=(3,), generator=g) for n in (20_000, 28_000))
+    fit = gf.fit_gmwm(gf.Recording(earlier, 100.0, unit="deg/s"), gf.WhiteNoise() + gf.RandomWalk())
+    report = gf.diagnose(gf.Recording(x, 100.0, unit="deg/s"), fit)
+    assert {f.mechanism for f in report.findings} == {"parameter_shift", "quantization_noise"}
+    assert report.held_out.before > 10
+    assert report.held_out.after < 1.7
+    added = next(f for f in report.findings if f.mechanism == "quantization_noise")
+    white = next(f for f in report.findings if f.mechanism == "parameter_shift")
+    for i, fitted in enumerate(fit.params[:, 0].tolist()):
+        factor, angle = white.parameters[f"white_factor[{i}]"], added.parameters[f"angle[{i}]"]
+        assert fitted > 1.2
+        assert abs(1 / fitted / factor.value - 1) < 0.15
+        assert abs(size / 100 / angle.value - 1) < 0.05

@@ -146,6 +146,32 @@ def test_modes_that_set_in_together_are_one_knock():
     assert len(found.effect.knocks) == 1
 
 
+def test_a_mode_that_is_struck_again_before_it_has_died_away_is_two_knocks_of_one_frequency():
+    path = struck(3000.0, 0.384, 128.0) - 0.9 * struck(3583.4, 0.384, 128.0)
+    strong = of_nats(path, 20_000.0) * torch.tensor([[1.0], [0.0], [0.0]], dtype=torch.float64)
+    found = RingDown.detect_and_fit(compared(strong, 5), 1e-3)
+    assert found is not None
+    assert isinstance(found.effect, RingDown)
+    onsets = (found.effect.onset_s * RATE).sort().values.tolist()
+    assert onsets == pytest.approx([3000.0, 3583.4], abs=3)
+    assert (found.effect.decay_s * RATE).tolist() == pytest.approx([128.0, 128.0], rel=0.1)
+    assert (found.effect.frequency_hz / RATE).tolist() == pytest.approx([0.384, 0.384], abs=2e-4)
+
+
+def test_many_knocks_of_one_mode_are_each_found():
+    """Seen from afar they are a line that comes and goes."""
+    g = generator(9)
+    onsets = (200 + 300 * torch.arange(24) + 200 * torch.rand(24, generator=g)).tolist()
+    path = sum((0.4 + float(torch.rand((), generator=g))) * struck(onset, 0.155, 24.0) for onset in onsets)
+    assert isinstance(path, Tensor)
+    comparison = compared(20 * GAINS[:, None] * path, 9)
+    found = RingDown.detect_and_fit(comparison, 1e-3)
+    assert found is not None
+    assert isinstance(found.effect, RingDown)
+    known = found.effect.onset_s * RATE
+    assert sum(float((known - onset).abs().min()) < 3 for onset in onsets) >= 20
+
+
 def test_modes_that_beat_seem_to_grow():
     path = struck(3000.0, 0.2, 60.0) - struck(3000.0, 0.206, 60.0)
     found = RingDown.detect_and_fit(compared(of_nats(path, 2000.0), 4), 1e-3)

@@ -158,6 +158,42 @@ def test_a_recording_that_something_was_taken_off_has_the_lattice_of_its_simulat
     step = float(recording.diff().std()) / 2
     left = amplitude * step * torch.cos(0.7 * torch.arange(recording.shape[-1]) + 1.0)  # of a tone not quite the one
     given = rounded(recording, step) - left
-    assert Quantization.detect_and_fit(Comparison.of(SCENE, given, rounded(simulation, step)), 1e-3) is None
+    taken = Comparison.of(SCENE, rounded(recording, step), rounded(simulation, step)).subtract(left)
+    assert Quantization.detect_and_fit(taken, 1e-3) is None
     assert missing_lattices(Comparison.of(SCENE, given, rounded(simulation, step)), 1.0).lattices == {}
     assert Quantization.detect_and_fit(Comparison.of(SCENE, given, simulation), 1e-3) is not None
+
+
+@pytest.mark.parametrize("finer", [0.0, 0.2], ids=["no step", "finer steps"])
+def test_rounding_that_only_the_simulation_has_is_told_and_goes(finer: float) -> None:
+    g = generator(21)
+    x = noise(N, g)
+    given = rounded(x, finer) if finer else x
+    report = gf.diagnose(given, rounded(noise(2 * N, g), 0.8), rate=RATE)
+    (found,) = report.findings
+    assert found.mechanism == "quantization"
+    assert "the simulation rounds to steps of 0.8" in found.sentence
+    assert found.parameters["simulated_lsb[0]"].value == pytest.approx(0.8)
+    assert [name in found.parameters for name in ("lsb[0]",)] == [bool(finer)]
+    assert not report.unexplained
+    if not finer:
+        before, after = (ax.dataLim.height for ax in found.plot())
+        assert before > 5 * after > 0  # the peak of the simulation's steps goes
+    simulated = report.model.simulate(N, generator=g)
+    lattices = exact_lattices(Comparison.of(report.model.info, simulated, simulated[None]).observed)
+    assert [None if own is None else round(own.step, 6) for own in lattices] == [finer or None] * P
+    assert not gf.diagnose(given, report.model, rate=RATE).mismatch
+
+
+def test_rounding_of_one_sensor_of_the_simulation_alone() -> None:
+    g = generator(22)
+    x, simulation = noise(N, g), rounded(noise(2 * N, g), 0.8)
+    given = torch.cat([rounded(x[:2], 0.8), x[2:]])
+    (found,) = gf.diagnose(given, simulation, rate=RATE).findings
+    assert (found.mechanism, found.sensors) == ("quantization", (2,))
+    # So much finer than the noise that nothing of it can be seen but the values themselves.
+    assert not gf.diagnose(x, rounded(noise(2 * N, g), 0.05), rate=RATE).mismatch
+    # Gaps were filled with means of their neighbours.
+    filled = rounded(x, 0.8)
+    filled[:, 1000:11000:50] = (filled[:, 999:10999:50] + filled[:, 1001:11001:50]) / 2
+    assert "quantization" not in {f.mechanism for f in gf.diagnose(filled, simulation, rate=RATE).findings}

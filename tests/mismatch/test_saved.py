@@ -18,6 +18,7 @@ import gyrofuse as gf
 from gyrofuse.mismatch.mechanisms.catalogue import CATALOGUE
 from gyrofuse.mismatch.mechanisms.coherence_remainder import CoherenceRemainder
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
+from gyrofuse.mismatch.mechanisms.regimes.channel_noise import ChannelNoise
 from gyrofuse.mismatch.mechanisms.regimes.chirp import Chirp
 from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
 from gyrofuse.mismatch.mechanisms.regimes.pulses import Pulses
@@ -34,9 +35,12 @@ from gyrofuse.mismatch.mechanisms.signals.clock import ClockSkew
 from gyrofuse.mismatch.mechanisms.signals.g_sensitivity import GSensitivity
 from gyrofuse.mismatch.mechanisms.signals.quadratic_coupling import QuadraticCoupling
 from gyrofuse.mismatch.mechanisms.signals.scale_factor import ScaleFactor
+from gyrofuse.mismatch.mechanisms.signals.sensor_delay import SensorDelay
+from gyrofuse.mismatch.mechanisms.signals.time_scale import TimeScale
 from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
 from gyrofuse.mismatch.mechanisms.signals.tone_amplitude import ToneSize
 from gyrofuse.mismatch.mechanisms.slow.bias_oscillation import BiasOscillation
+from gyrofuse.mismatch.mechanisms.slow.late_warm_up import LateWarmUp
 from gyrofuse.mismatch.mechanisms.slow.ramp import Ramp
 from gyrofuse.mismatch.mechanisms.slow.slow_remainder import SlowRemainder
 from gyrofuse.mismatch.mechanisms.slow.step import Step
@@ -56,6 +60,7 @@ from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
 from gyrofuse.mismatch.mechanisms.values.interleaving import Interleaving
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
+from gyrofuse.mismatch.mechanisms.values.sensor_gain import SensorGain
 from gyrofuse.mismatch.mechanisms.values.stuck_samples import StuckSamples
 from gyrofuse.mismatch.mechanisms.values.unit_scale import UnitScale
 from gyrofuse.mismatch.repair import serialise as saved
@@ -82,9 +87,12 @@ MODE = Mode(0.11, 0.01, complex_numbers(0.3 + 0.1j, 0.2), True)
 # One of every class in the catalogue, with numbers that JSON has to round and none that are alike.
 EVERY = (
     UnitScale(math.degrees(1)),
+    SensorGain(numbers(-1 / 3, 1.0)),
     Quantization(numbers(0.3, 0.0), numbers(0.01, 0.0), numbers(0.2, 0.0), numbers(1 / 3, 0.1)),
+    Quantization(numbers(0.3, 0.0), numbers(0.01, 0.0), numbers(0.0, 0.0), numbers(1 / 3, 0.1), (0.0, 1 / 3)),
     Clipping(numbers(-0.7, -math.inf), numbers(math.inf, 1 / 3), numbers(0.1, 0.2)),
     StuckSamples(numbers(0.2, 0.1), numbers(0.01, 0.0), True),
+    StuckSamples(numbers(0.2, 0.0), numbers(0.01, 0.0), False, (7.3, 1.0), (1 / 3, 0.0)),
     ScaleMixture(numbers(0.2, 0.0), numbers(3.0, 1.0)),
     Spikes(numbers(0.05, 0.0), numbers(7 / 3, 0.0), numbers(0.3, 0.0), True),
     ClockSkew((1,), 1e-5 / 3, ((200, 2), (300, 1)), 0.07, complex_numbers(0.3j), complex_numbers(0.1)),
@@ -108,6 +116,7 @@ EVERY = (
         4.0,
     ),
     Interleaving(numbers(1 / 3, 0.0)),
+    ChannelNoise("motor", 0, "size", numbers(0.1, 1 / 3), 1.0, numbers(1.1, 1.0), numbers(7 / 3, 1.0), 1.5),
     ChannelCoupling("motor", torch.tensor([[1 / 3], [0.0]], dtype=torch.float64)),
     BiasOscillation(numbers(1 / 3, 0.0), torch.zeros(2, 4, dtype=torch.float64), numbers(0.2, 0.0), 20 / 3),
     Chirp(
@@ -125,11 +134,23 @@ EVERY = (
         10.0,
     ),
     VibrationTone(7.3, numbers(0.3, 0.0), numbers(0.1, 0.2)),
+    TimeScale(
+        1.04 / 3 + 0.7,
+        (7.3, 20 / 3),
+        torch.tensor([[0.3j, 0.1], [0.2, 0.0]], dtype=torch.complex128),
+        numbers(0.1, 0.2),
+        torch.tensor([[0.1, 1 / 3], [0.0, 0.0]], dtype=torch.float64),
+    ),
+    SensorDelay(numbers(0.0, 1 / 3)),
     ToneSize(7.3, numbers(0.3, 1 / 3)),
     RandomTelegraph(numbers(0.3, 0.0), numbers(1 / 3, 1.0), numbers(0.2, 1.0)),
     TemperatureDrift(
         numbers(1 / 3, 0.0), torch.zeros(2, 4, dtype=torch.float64), 0.7, "temperature", 0, (numbers(0.1, 0.0),)
     ),
+    TemperatureDrift(
+        numbers(1 / 3, 0.0), torch.zeros(2, 4, dtype=torch.float64), 0.7, "temperature", 0, (), (numbers(0.1, 0.2),)
+    ),
+    LateWarmUp(numbers(1 / 3, 0.0), torch.zeros(2, 4, dtype=torch.float64), 1.7, 2.3),
     WarmUpTransient(
         numbers(1 / 3, 0.0), torch.zeros(2, 4, dtype=torch.float64), 2.3, (Decay(numbers(0.2, 0.0), 20 / 3),)
     ),

@@ -94,3 +94,18 @@ def test_episodes_and_gaussian_noise_are_none():
     louder = torch.where(episodes, 3.0, 1.0) * quiet
     names = [finding.mechanism for finding in gf.diagnose(louder, NOISE, rate=100.0).findings]
     assert "scale_mixture" not in names
+
+
+def test_jumps_that_a_filter_draws_out_are_no_second_level():
+    """Of a telegraph behind a converter's filter, each jump is louder for some samples."""
+    n, rate = 16_384, 800.0
+    g = torch.Generator().manual_seed(7)
+    fine = 8
+    stays = torch.empty(400, dtype=torch.float64).exponential_(generator=g) * 180 * fine
+    switches = torch.searchsorted(stays.cumsum(0), torch.arange(n * fine, dtype=torch.float64))
+    jumps = dsp.decimate((1.0 - 2.0 * (switches % 2)).numpy(), fine)
+    signal = torch.randn(2, n, generator=g, dtype=torch.float64)
+    signal[0] += 4.5 * torch.from_numpy(jumps.copy())
+    report = gf.diagnose(signal, gf.WhiteNoise(1.0), rate=rate)
+    assert [finding.mechanism for finding in report.findings] == ["random_telegraph"]
+    assert report.findings[0].parameters["half_step[0]"].value == pytest.approx(4.5, rel=0.02)

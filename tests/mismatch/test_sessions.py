@@ -113,6 +113,8 @@ def test_a_mean_of_recordings_has_their_scatter():
 
 def test_what_does_not_fit_is_refused():
     one, other = recordings()[:2]
+    with pytest.raises(TypeError, match="expected a sequence of two or more, got one Recording; use `diagnose`"):
+        diagnose_sessions(one, NOISE)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="`recordings`: expected two or more of one device, got 1; use `diagnose`"):
         diagnose_sessions([one], NOISE)
     with pytest.raises(ValueError, match=r"expected the 100 Hz of the first one in all, got 50 Hz in 2; resample it"):

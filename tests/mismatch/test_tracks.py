@@ -9,6 +9,8 @@ from scipy import stats
 from torch import Tensor
 
 from gyrofuse.mismatch.detectors.lines import track_fit, tracks
+from gyrofuse.mismatch.detectors.lines.chirps import chirp_test
+from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 
 
 def noise(seed: int, *shape: int) -> Tensor:
@@ -97,3 +99,14 @@ def test_noise_shows_no_track_more_often_than_it_says(n_sensors: int) -> None:
     alarms = sum(p < 0.05 for p in p_values)
     assert stats.binomtest(alarms, len(p_values), 0.05, alternative="greater").pvalue > 0.01
     assert min(p_values) < 0.9  # and says something
+
+
+def test_pulses_are_no_line_that_moves() -> None:
+    """They have all frequencies: two of them would have any track that passes."""
+    n = 22_186
+    pulse = torch.tensor([-100.0, -190.0, -130.0, -60.0])
+    signal, simulation = noise(5, 3, n), noise(6, 1, 3, n)
+    for at in (4836, 14_129):
+        signal[:, at : at + 4] += pulse
+    comparison = Comparison.of(RecordingInfo(1000.0, "deg/s", ("1", "2", "3")), signal, simulation)
+    assert chirp_test(comparison).p_value > 1e-3

@@ -7,6 +7,7 @@ import pytest
 import torch
 from mismatch_draws import LEVEL, SCENE, N, covers, drawn, even, nominated, normal, settled
 
+import gyrofuse as gf
 from gyrofuse import AR1, WhiteNoise
 from gyrofuse.mismatch.detectors.values import quantisation_grid as lattices
 from gyrofuse.mismatch.detectors.values import values as marginals
@@ -223,6 +224,45 @@ def test_a_largest_value_that_recurs_on_a_fine_lattice_is_no_end_stop() -> None:
     assert min(end.p_value for end in marginals.end_stops(Comparison.of(SCENE, recording, simulation))) > LEVEL
 
 
+def test_what_saturates_does_not_repeat_itself() -> None:
+    """A vibration beyond full scale holds the limit for some samples each time."""
+    recording, simulation, _ = drawn(21)
+    vibration = 8 * (1.5 + (torch.arange(N) * 0.002).sin()) * (2 * torch.pi * 0.0415 * torch.arange(N)).cos()
+    recording, simulation = (recording + vibration).clamp(-13, 12), simulation + vibration
+    comparison = Comparison.of(SCENE, recording, simulation)
+    assert StuckSamples.detect_and_fit(comparison, LEVEL) is None
+    found = nominated(comparison, Clipping)
+    assert found.sensors == (0, 1, 2)
+    assert {p.value for p in found.parameters.values()} == {12.0, -13.0}
+    assert marginals.values_test(found.repair(comparison, torch.Generator().manual_seed(1))).p_value > 0.01
+
+
+@pytest.mark.parametrize("value", [0.0, -40.0])
+def test_a_value_in_the_place_of_samples_is_told(value: float) -> None:
+    """Zeros or an error code, next to the sensor's own values or far from them: no limit, no shocks."""
+    recording, simulation, g = drawn(22)
+    recording = recording + torch.tensor([[0.2], [3.4], [-1.0]], dtype=torch.float64)
+    for at in (even(25, g=g) * (N - 80)).long().tolist():
+        recording[:, at : at + 8 + at % 30] = value
+    report = gf.diagnose(gf.Recording(recording, rate=SCENE.rate), gf.Recording(simulation[0], rate=SCENE.rate))
+    (found,) = report.findings
+    assert (found.mechanism, found.sensors) == ("stuck_samples", (0, 1, 2))
+    assert found.sentence.startswith(f"samples are {value:.6g} units, which stands in their place")
+    assert not report.unexplained
+    assert report.held_out.after < 2
+    again = found.effect.apply(simulation[0], SCENE, torch.Generator().manual_seed(1))
+    assert bool((again == value).all(0).any())
+    assert 0.5 < float((again == value).double().mean() / (recording == value).double().mean()) < 2
+
+
+def test_a_stretch_that_was_logged_twice_has_no_limits() -> None:
+    recording, simulation, _ = drawn(23)
+    recording[:, 3000:4000] = recording[:, 1000:2000]
+    for row in recording:  # the largest and the smallest value come twice
+        row[[1300, 3300]], row[[1700, 3700]] = 6.0, -6.0
+    assert Clipping.detect_and_fit(Comparison.of(SCENE, recording, simulation), LEVEL) is None
+
+
 @pytest.mark.parametrize(("step", "length"), [(0.0, 150), (0.0, 12), (0.3, 300)])
 def test_a_sensor_that_hangs_repeats_samples_and_is_no_quiet_noise(step: float, length: int) -> None:
     """Three times, rounded or not: named with its rows, and filled in for all that is searched after it."""
@@ -309,3 +349,14 @@ def test_a_value_filled_in_is_no_dead_band() -> None:
     recording[0, even(N, g=g) < 0.02] = 0.1
     found = Quantization.detect_and_fit(Comparison.of(SCENE, recording, simulation), LEVEL)
     assert found is None or "dead_band[0]" not in found.parameters
+
+
+def test_one_long_row_is_a_sensor_that_hangs() -> None:
+    recording, simulation, g = drawn(21)
+    recording[1, N // 2 :] = recording[1, N // 2]
+    comparison = Comparison.of(SCENE, recording, simulation)
+    found = nominated(comparison, StuckSamples)
+    assert found.sensors == (1,)
+    assert found.parameters["probability[1]"].value == pytest.approx(0.5, abs=0.01)
+    after = settled(comparison, found, g)
+    assert variance_p_value(after) > 0.001

@@ -208,6 +208,10 @@ class Surroundings:
                 break
             step, onsets = max(step // 3, 1), [first.onset + k * step for k in (-2, -1, 0, 1, 2)]
             tone = first
+        return self._both(first, second)
+
+    def _both(self, first: DampedTone, second: DampedTone) -> tuple[FittedTone, FittedTone]:
+        """Two tones with the sizes that fit best together."""
         size, log_ratio = self.regression(self._tone_paths(first, second))
         alone = self.of_tone(first).log_ratio
         return FittedTone(first, size[:2], log_ratio), FittedTone(second, size[2:], (log_ratio - alone).clamp(min=0))
@@ -232,6 +236,26 @@ class Surroundings:
         )
         return -float(found.fun), *at(found.x)
 
+    def two_knocks(self, start: FittedTone, sensors: Sequence[int]) -> tuple[FittedTone, FittedTone]:
+        """One mode that is struck once more before it has died away, as `two_modes` gives them."""
+        which, tone = list(sensors), start.tone
+        tried = [
+            (one, one._replace(onset=one.onset + round(k * one.tau)))
+            for one in (tone._replace(tau=factor * tone.tau) for factor in (0.4, 0.7, 1.0))
+            for k in (-6.0, -4.0, -2.8, -2.0, -1.4, -1.0, -0.5, 0.5, 1.0, 1.4, 2.0, 2.8, 4.0, 6.0, 8.0)
+        ]
+        first, second = max(tried, key=lambda both: self._gain(which, *both))
+        step = max(round(first.tau / 8), 1)
+        while True:
+            first = self._numbers(first, which, second)
+            second = first._replace(onset=second.onset)
+            second = self._onset(second, which, 2 * step, step, first)
+            first = self._onset(first, which, 2 * step, step, second)
+            if step == 1:
+                break
+            step = max(step // 4, 1)
+        return self._both(first, second)
+
     def refined(self, start: DampedTone, sensors: Sequence[int]) -> FittedTone:
         """The likeliest frequency and time constant next to those of a start, at its onset: by Gauss and Newton."""
         best, most = self.of_tone(start), 4  # steps
@@ -247,21 +271,21 @@ class Surroundings:
                 break
         return best
 
-    def _onset(self, tone: DampedTone, which: list[int], reach: int, step: int) -> DampedTone:
+    def _onset(self, tone: DampedTone, which: list[int], reach: int, step: int, *others: DampedTone) -> DampedTone:
         last = self.first + self.samples.shape[-1] - 2
         onsets = {min(max(tone.onset + k, self.first), last) for k in range(-reach, reach + 1, step)}
         tried = [tone._replace(onset=onset) for onset in sorted(onsets)]
-        return max(tried, key=lambda one: self._gain(which, one))
+        return max(tried, key=lambda one: self._gain(which, one, *others))
 
-    def _numbers(self, tone: DampedTone, which: list[int]) -> DampedTone:
-        """Frequency and time constant, of an onset."""
+    def _numbers(self, tone: DampedTone, which: list[int], *again: DampedTone) -> DampedTone:
+        """Frequency and time constant of an onset, and of those where the same mode is struck again."""
 
         def at(point: NDArray[np.float64]) -> DampedTone:
             return self._moved(tone, float(point[0]), float(point[1]))
 
         simplex = np.array([[0.0, 0.0], [0.1, 0.0], [0.0, 0.4]])
         found = optimize.minimize(
-            lambda point: -self._gain(which, at(point)),
+            lambda point: -self._gain(which, *(at(point)._replace(onset=one.onset) for one in (tone, *again))),
             simplex[0],
             method="Nelder-Mead",
             options={"initial_simplex": simplex, "maxfev": 60, "xatol": 1e-3, "fatol": 1e-3},
@@ -334,6 +358,10 @@ class Surroundings:
         grown = [swelling(k / 2 * tone.tau, power, w * tone.tau) for k in range(-1, 5) for power, w in widths]
         lasting = _lasting(y * _turned(-angle))
         return max(float(torch.stack([step, *grown, lasting]).max()), self.of_no_course(which))
+
+    def explained(self, found: FittedTone) -> Tensor:
+        """Share of the energy of whitened samples that a tone explains, `(sensor,)`, from its likelihood ratios."""
+        return 1 - torch.exp(-2 / self._own.shape[-1] * found.log_ratio)
 
     def of_no_course(self, sensors: Sequence[int]) -> float:
         """Log likelihood ratio of one sample that is off, or of noise that is louder for a while."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -27,7 +27,8 @@ _RATIO, _RATIO_SD = (
     0.8,
 )  # of spread to height beforehand: median, and sd of its logarithm, a factor of five at 2 sd
 
-_Law = Callable[..., NDArray[np.float64]]
+Array = NDArray[np.float64]
+_Law = Callable[..., Array]
 
 
 class Outliers(NamedTuple):
@@ -119,11 +120,39 @@ class Sample:
         large = size[size >= bulk]
         self.values, self.counts = torch.cat([centres, large]), torch.cat([counts, torch.ones_like(large)])
         self.n = float(self.counts.sum())
+        self._values, self._counts = self.values.numpy(), self.counts.numpy()
 
-    def deviance(self, law: Outliers) -> float:
-        """Minus the log likelihood and the log prior density of the spread, nats."""
-        beforehand = (math.log(law.spread / law.height / _RATIO) / _RATIO_SD) ** 2 / 2
-        return beforehand - float((self.counts * mixture(self.values, law)).sum())
+    def deviance(self, theta: Sequence[float] | Array) -> tuple[float, Array]:
+        """Minus the log likelihood of `law_of(theta)` and the log prior density of its spread, nats, and their slopes.
+
+        By expectation over which values are outliers, and on which side (Fisher's identity).
+        """
+        law, v = law_of(list(theta)), self._values
+        q = (law.spread / law.height) ** 2
+        plain, moved = law.scale**2, law.scale**2 + law.spread**2
+        up, down = (v - law.height) ** 2 / (2 * moved), (v + law.height) ** 2 / (2 * moved)
+        hit = np.logaddexp(-up, -down) - math.log(8 * math.pi * moved) / 2
+        spared = -(v**2) / (2 * plain) - math.log(2 * math.pi * plain) / 2
+        mixed = np.logaddexp(math.log1p(-law.rate) + spared, math.log(law.rate) + hit)
+        weight = self._counts * np.exp(math.log(law.rate) + hit - mixed)
+        upper = weight * special.expit(down - up)
+        number = float(weight.sum())
+        number_plain = self.n - number
+        by_height = float((2 * upper - weight) @ v - number * law.height) / moved
+        by_moved = (float(upper @ up + (weight - upper) @ down) - number / 2) / moved
+        by_plain = (float((self._counts - weight) @ v**2) / (2 * plain) - number_plain / 2) / plain
+        spread = 2 * law.spread**2 * by_moved
+        slopes = np.array(
+            [
+                number - number_plain * law.rate / (1 - law.rate),
+                law.height * by_height + spread,
+                (spread - q * law.height * by_height) / (1 + q),
+                2 * plain * (by_moved + by_plain),
+            ]
+        )
+        off = (math.log(q) / 2 - math.log(_RATIO)) / _RATIO_SD
+        slopes[2] -= off / _RATIO_SD
+        return off**2 / 2 - float(self._counts @ mixed), -slopes
 
 
 def law_of(theta: Sequence[float]) -> Outliers:
@@ -151,14 +180,15 @@ def fitted(z: Tensor) -> Outliers:
         number = float(counts[beyond].sum())
         height = float((counts * values)[beyond].sum()) / number if level == 6.0 and number else least
         starts.append([math.log(max(number, 1.0) / n), math.log(height), math.log(_RATIO), 0.0])
-    runs = [_minimised(lambda theta: sample.deviance(law_of(theta.tolist())), start, bounds_of(n)) for start in starts]
+    runs = [_minimised(sample.deviance, start, bounds_of(n), slopes=True) for start in starts]
     return law_of(min(runs, key=lambda run: float(run.fun)).x.tolist())
 
 
 def _minimised(
-    deviance: Callable[[NDArray[np.float64]], float], start: Sequence[float], bounds: Sequence[tuple[float, float]]
+    deviance: Callable[..., Any], start: Sequence[float], bounds: Sequence[tuple[float, float]], *, slopes: bool = False
 ) -> optimize.OptimizeResult:
-    return optimize.minimize(deviance, start, method="L-BFGS-B", bounds=bounds, options={"maxiter": 60})
+    """The least of a function, which gives its slopes as well or has them taken by differences."""
+    return optimize.minimize(deviance, start, method="L-BFGS-B", jac=slopes, bounds=bounds, options={"maxiter": 60})
 
 
 def heavy_tailed(z: Tensor) -> float:
@@ -185,12 +215,12 @@ def heavy_tailed(z: Tensor) -> float:
     )
 
 
-def _student(z: NDArray[np.float64], freedom: float, scale: float) -> NDArray[np.float64]:
+def _student(z: Array, freedom: float, scale: float) -> Array:
     """Log density of `scale` times a Student variable."""
     return np.asarray(stats.t.logpdf(z / scale, freedom)) - math.log(scale)
 
 
-def _normal_laplace(z: NDArray[np.float64], width: float, sd: float) -> NDArray[np.float64]:
+def _normal_laplace(z: Array, width: float, sd: float) -> Array:
     """Log density of `sd` times a normal plus `width` times a Laplace variable."""
     r = sd / width
     up, down = -z / width + special.log_ndtr(z / sd - r), z / width + special.log_ndtr(-z / sd - r)

@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import torch
 from scipy.signal import lfilter
@@ -37,6 +38,8 @@ class Family:
         design_at: Designs at other points; None where only those of the grid exist.
         jumps: Whether templates are jumps at once: several of them, in any order, are another path than one.
         timed: Whether the first nonlinear number is a time after the first sample.
+        form: Of a drift with a temperature.
+        becomes: Name of the mechanism that its shortest templates are: no look-alike of that.
     """
 
     name: str
@@ -48,6 +51,8 @@ class Family:
     design_at: Callable[[Tensor], Tensor] | None = None
     jumps: bool = False
     timed: bool = False
+    form: ThermalForm | None = None
+    becomes: str = ""
 
     def at(self, points: Tensor) -> Family:
         """The same mechanism at other points `(template, number)`."""
@@ -71,18 +76,17 @@ def declared_families(comparison: Comparison) -> tuple[Family, ...]:
 
 def steps(comparison: Comparison) -> Family:
     """Steps at the edges of blocks and in their middles."""
-    at = edges()
-    middles = (at[:-1] + at[1:]) / 2
-    onsets = torch.cat([torch.arange(1.0, N_BLOCKS), torch.arange(1.5, N_BLOCKS - 1)]).to(torch.float64)
-    order = onsets.argsort()
-    return Family(
-        "step",
-        onsets[order, None] * comparison.block,
-        torch.cat([at, middles])[order, None],
-        "the bias steps near {:.4g} s",
-        jumps=True,
-        timed=True,
-    )
+    at, block = edges(), comparison.block
+
+    def design_at(points: Tensor) -> Tensor:
+        # A step within a block is what lies between those at its two edges.
+        place = (points[:, 0] / block - 1).clamp(0, len(at) - 1)
+        before = place.floor().long().clamp(max=len(at) - 2)
+        return torch.lerp(at[before], at[before + 1], (place - before)[:, None])[:, None]
+
+    onsets = block * torch.arange(1.0, N_BLOCKS - 0.5, 0.5, dtype=torch.float64)[:, None]
+    words = "the bias steps near {:.4g} s"
+    return Family("step", onsets, design_at(onsets), words, design_at=design_at, jumps=True, timed=True)
 
 
 def warm_ups(comparison: Comparison, number: int) -> Family:
@@ -105,19 +109,51 @@ def warm_ups(comparison: Comparison, number: int) -> Family:
 
 
 def temperatures(comparison: Comparison) -> list[Family]:
-    """Each row of each temperature, in a straight line and a bent one, with lags up to a quarter of the record."""
+    """Each row of each temperature in every form of a drift, with lags up to a quarter of the record."""
     grid = _log_grid(comparison.block / 2, comparison.n_samples / 4, _LAGS - 1)
     lags = torch.cat([torch.zeros_like(grid[:1]), grid])[:, None]
     families = []
     for channel, row in temperature_rows(comparison):
-        straight, bent = (
-            partial(_temperature_designs, comparison.info, channel, row, comparison.n_samples, columns)
-            for columns in (1, 2)
-        )
-        designs, words = bent(lags), f"the bias follows {channel}".replace("{", "{{").replace("}", "}}")
-        families.append(Family("temperature_drift", lags, designs[:, :1], words, channel, row, straight))
-        families.append(Family("temperature_drift", lags, designs, words, channel, row, bent))
+        words = f"the bias follows {channel}".replace("{", "{{").replace("}", "}}")
+        for most, changes in ((3, False), (2, True)):
+            designs_of = partial(_temperature_designs, comparison.info, channel, row, comparison.n_samples)
+            points = lags[1:] if changes else lags
+            whole = designs_of(ThermalForm(most, changes), points)  # of which those of fewer powers are a part
+            for powers in range(1, most + 1):
+                form = ThermalForm(powers, changes)
+                designs = torch.cat([whole[:, :powers], whole[:, most:]], 1)
+                families.append(
+                    Family(
+                        "temperature_drift", points, designs, words, channel, row, partial(designs_of, form), form=form
+                    )
+                )
     return families
+
+
+class ThermalForm(NamedTuple):
+    """What a bias has of a temperature.
+
+    Attributes:
+        powers: Powers of the temperature, from the first one on.
+        changes: Whether it has a share of the temperature's rate of change as well, which is what a lag of its own in
+            every sensor looks like.
+    """
+
+    powers: int
+    changes: bool
+
+    def paths(self, temperature: Tensor, lagging: Tensor, lag: float) -> Tensor:
+        """Paths for sizes of one, `(path, time)`.
+
+        Args:
+            temperature: Temperature, `(time,)`.
+            lagging: The same with a lag.
+            lag: The lag, samples or seconds, by which the rate of change is counted.
+        """
+        at_work = temperature if self.changes else lagging
+        path = at_work - at_work[0]
+        change = [(temperature - lagging) / lag] if self.changes else []
+        return torch.stack([*(path**k for k in range(1, self.powers + 1)), *change])
 
 
 def temperature_rows(comparison: Comparison) -> list[tuple[str, int]]:
@@ -132,18 +168,16 @@ def temperature_rows(comparison: Comparison) -> list[tuple[str, int]]:
 
 
 def _temperature_designs(
-    info: RecordingInfo, channel: str, row: int, n_samples: int, columns: int, lags: Tensor
+    info: RecordingInfo, channel: str, row: int, n_samples: int, form: ThermalForm, lags: Tensor
 ) -> Tensor:
-    """Ordinates of a temperature with lags `(template, 1)`, samples, less its first value, and of its square.
-
-    With one column, of the temperature alone.
-    """
-    designs = []
-    for lag in lags[:, 0].tolist():
-        path = lagged(info, channel, row, lag, n_samples)
-        path = path - path[0]
-        designs.append(slow_ordinates(torch.stack([path, path.square()][:columns])))
-    return torch.stack(designs)
+    """Ordinates of what a drift has of a temperature with lags `(template, 1)`, samples."""
+    temperature = lagged(info, channel, row, 0.0, n_samples)
+    return torch.stack(
+        [
+            slow_ordinates(form.paths(temperature, lagged(info, channel, row, lag, n_samples), lag))
+            for lag in lags[:, 0].tolist()
+        ]
+    )
 
 
 def lagged(info: RecordingInfo, channel: str, row: int, lag: float, n_samples: int) -> Tensor:

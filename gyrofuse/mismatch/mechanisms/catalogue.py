@@ -11,6 +11,7 @@ from collections.abc import Iterable
 
 from gyrofuse.mismatch.mechanisms.coherence_remainder import CoherenceRemainder
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
+from gyrofuse.mismatch.mechanisms.regimes.channel_noise import ChannelNoise
 from gyrofuse.mismatch.mechanisms.regimes.chirp import Chirp
 from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
 from gyrofuse.mismatch.mechanisms.regimes.pulses import Pulses
@@ -27,9 +28,12 @@ from gyrofuse.mismatch.mechanisms.signals.clock import ClockSkew
 from gyrofuse.mismatch.mechanisms.signals.g_sensitivity import GSensitivity
 from gyrofuse.mismatch.mechanisms.signals.quadratic_coupling import QuadraticCoupling
 from gyrofuse.mismatch.mechanisms.signals.scale_factor import ScaleFactor
+from gyrofuse.mismatch.mechanisms.signals.sensor_delay import SensorDelay
+from gyrofuse.mismatch.mechanisms.signals.time_scale import TimeScale
 from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
 from gyrofuse.mismatch.mechanisms.signals.tone_amplitude import ToneSize
 from gyrofuse.mismatch.mechanisms.slow.bias_oscillation import BiasOscillation
+from gyrofuse.mismatch.mechanisms.slow.late_warm_up import LateWarmUp
 from gyrofuse.mismatch.mechanisms.slow.ramp import Ramp
 from gyrofuse.mismatch.mechanisms.slow.slow_remainder import SlowRemainder
 from gyrofuse.mismatch.mechanisms.slow.step import Step
@@ -48,6 +52,7 @@ from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
 from gyrofuse.mismatch.mechanisms.values.interleaving import Interleaving
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
+from gyrofuse.mismatch.mechanisms.values.sensor_gain import SensorGain
 from gyrofuse.mismatch.mechanisms.values.stuck_samples import StuckSamples
 from gyrofuse.mismatch.mechanisms.values.unit_scale import UnitScale
 
@@ -57,18 +62,19 @@ def _stage_of(kind: type[Mechanism]) -> int:
 
 
 STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
-    (UnitScale,),
+    (UnitScale, SensorGain),
     (Quantization, Clipping, StuckSamples),  # facts on the numbers themselves
     (Spikes, ScaleMixture),
-    (ClockSkew,),
+    (ClockSkew, TimeScale),
     (GSensitivity, QuadraticCoupling, ScaleFactor, ChannelCoupling, ChannelTransfer),
     (Chirp,),  # which passes any frequency
     (RingDown, Pulses),  # whose strongest are lines too
     (VibrationTone, ToneInSpells, ToneSize, Interleaving),
     (RandomTelegraph,),
-    (GradualChange,),  # where noise is louder, what is slow is known less well
-    (TemperatureDrift, WarmUpTransient, Ramp, Step, BiasOscillation),
+    (ChannelNoise, GradualChange),  # where noise is louder, what is slow is known less well
+    (TemperatureDrift, WarmUpTransient, LateWarmUp, Ramp, Step, BiasOscillation),
     (VarianceChange,),  # to which large jumps look alike
+    (SensorDelay,),  # to which sources and modes in common would be a makeshift
     (
         ParameterShift,
         LowPassFilter,

@@ -67,6 +67,7 @@ class Mechanism:
         identified: Whether it is physics with a name, and not what is left of a difference.
         refit_after_others: Whether it is fitted anew to what the others leave wherever blocks are held out.
         level_after_repairs: Factor of the significance level once another finding was repaired.
+        rescales: Whether it puts the simulation's numbers into another unit.
         time_words: Words for the time of a finding in a report.
         remark: Sentence in the report where a repaired simulation has it without a finding.
     """
@@ -87,6 +88,7 @@ class Mechanism:
     identified: ClassVar[bool] = True
     refit_after_others: ClassVar[bool] = False
     level_after_repairs: ClassVar[float] = 1.0
+    rescales: ClassVar[bool] = False
     time_words: ClassVar[str] = "sets in at"
     remark: ClassVar[str] = ""
     simulated = RenamedAttribute("apply")
@@ -150,6 +152,10 @@ class Mechanism:
     def with_company(self, comparison: Comparison) -> tuple[Mechanism, tuple[Mechanism, ...]]:
         """The mechanism by itself, and what it was found beside; by default nothing."""
         return self, ()
+
+    def beneath(self, later: Sequence[Mechanism], before: Comparison) -> Mechanism:
+        """The mechanism as it is judged where `later` ones, which act after it, are applied to `before` already."""
+        return self
 
     def apply_elsewhere(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
         """That of another recording with a simulation that has it; what has another phase there is applied to it."""
@@ -234,14 +240,13 @@ class Mechanism:
         """The same path with other amplitudes."""
         raise NotImplementedError
 
-    @property
-    def unit_factor(self) -> float:
-        """Factor by which the simulation's numbers are in another unit; 1 by default."""
-        return 1.0
-
     def in_unit(self, factor: float) -> Mechanism:
         """The same mechanism of numbers that are a factor larger."""
         return self
+
+    def left_of(self, own: Sequence[Mechanism]) -> tuple[Mechanism, ...]:
+        """What is left of effects that the simulation has itself, where it has this one too; by default all."""
+        return tuple(own)
 
 
 class Alternative(NamedTuple):
@@ -387,13 +392,7 @@ class Finding:
 
 
 def repaired(comparison: Comparison, parts: Iterable[Mechanism | Finding], generator: torch.Generator) -> Comparison:
-    """The comparison with mechanisms or findings repaired, one after the other.
-
-    Args:
-        comparison: Recording and simulation.
-        parts: What is repaired, in order.
-        generator: Source of the random numbers of what is applied to the simulation.
-    """
+    """The comparison with mechanisms or findings repaired, one after the other, by random numbers of a generator."""
     for part in parts:
         comparison = part.repair(comparison, generator)
     return comparison

@@ -83,8 +83,8 @@ def _means(ax: Axes, comparison: Comparison, sensor: int, x: Tensor, label: str,
     means = block_means(comparison.recording[sensor])
     handles = _plot(ax, x, means - means.mean(), **_DOT)
     if path is not None:
-        order, fitted = x.argsort(), block_means(path[sensor])
-        handles += _plot(ax, x[order], (fitted - fitted.mean())[order], **DASHED)
+        fitted = block_means(path[sensor])  # in the order of time: where the way counts it is a loop
+        handles += _plot(ax, x, fitted - fitted.mean(), **DASHED)
     _finish(ax, handles, ["recording", "fitted"], label, with_unit("mean of a block", comparison.info.measure))
 
 
@@ -138,8 +138,8 @@ def ratio_of_spectra(ax: Axes, comparison: Comparison, sensor: int, factor: Call
     _finish(ax, handles, labels, "frequency (Hz)", "recording over simulation, power")
 
 
-def coherence(ax: Axes, comparison: Comparison, sensor: int, shared: Tensor) -> None:
-    """Coherence of a sensor with the one it shares most with, by band of frequency, and the reach of chance.
+def coherence(ax: Axes, comparison: Comparison, sensor: int, shared: Tensor, *, in_phase: bool = False) -> None:
+    """Coherence, or its part in phase, of a sensor with the one it shares most with, by band, and the reach of chance.
 
     Args:
         ax: Axes to draw into.
@@ -153,15 +153,16 @@ def coherence(ax: Axes, comparison: Comparison, sensor: int, shared: Tensor) -> 
     hertz, dof = comparison.bands.frequency * comparison.info.rate, comparison.observed.coherence_dof
     handles: list[Any] = []
     for side, style in ((comparison.observed, _DOT), (comparison.reference, _LINE)):
-        handles += _plot(ax, hertz, side.coherence[:, sensor, other].abs(), **style)
+        value = side.coherence[:, sensor, other]
+        handles += _plot(ax, hertz, value.real if in_phase else value.abs(), **style)
     # The square of a coherence of `d` ordinates of independent sensors exceeds x with probability (1 - x)^(d - 1).
     known, chance = dof > 1, 0.05 / len(dof)
     limit = (1 - chance ** (1 / (dof[known] - 1))).sqrt()
     handles += _plot(ax, hertz[known], limit, **DASHED)
     ax.set_xscale("log")
-    ax.set_ylim(0, 1.02)
+    ax.set_ylim(-1.02 if in_phase else 0, 1.02)
     labels = [f"recording, {pair}", "simulation", "independent sensors: 1 picture in 20 has a dot above"]
-    _finish(ax, handles, labels, "frequency (Hz)", f"coherence of {pair}")
+    _finish(ax, handles, labels, "frequency (Hz)", f"coherence of {pair}{', in phase' if in_phase else ''}")
 
 
 def values(ax: Axes, comparison: Comparison, sensor: int, centre: float, width: float) -> None:

@@ -80,8 +80,8 @@ def modelled(
         fitted_samples: Of each sensor, that a model without a record of its own was estimated from.
 
     Raises:
-        ValueError: Not a positive number, samples of a model that says so itself or of what is none, or a ranking
-            without a fit of every sensor.
+        ValueError: Not a positive number, samples of a model that says so itself or of what is none, a fit at another
+            rate, or a ranking without a fit of every sensor.
     """
     if isinstance(simulation, RankResult):
         best = [fit.model for fit in simulation.best if fit is not None]
@@ -92,6 +92,12 @@ def modelled(
             )
         simulation = ArrayModel.from_sensors(best)
     if isinstance(simulation, GMWMResult | ArrayGMWMResult | JointFit):
+        fitted = (simulation.joint if isinstance(simulation, JointFit) else simulation).rate
+        if isinstance(recording, Recording) and fitted is not None and not same_rate(fitted, recording.rate):
+            raise ValueError(
+                f"`simulation`: expected a fit of records at {recording.rate:g} Hz as of the recording, got one at "
+                f"{fitted:g} Hz; its numbers are per sample: fit a record at this rate"
+            )
         simulation = simulation.model
     if isinstance(simulation, SessionModel):
         return _sessions(simulation, recording)
@@ -241,6 +247,11 @@ def _samples(simulation: Recording | Tensor, info: RecordingInfo, n_samples: int
             raise ValueError(
                 f"`simulation`: expected samples at {info.rate:g} Hz as in the recording, got {simulation.rate:g} Hz; "
                 "simulate at the recording's rate, or resample"
+            )
+        if not from_tensor and simulation.sensors != info.sensors and set(simulation.sensors) == set(info.sensors):
+            raise ValueError(
+                f"`simulation`: expected the sensors in the order {', '.join(info.sensors)} of the recording, got "
+                f"{', '.join(simulation.sensors)}; reorder them with `select(sensors=...)`"
             )
         both = {info.unit, simulation.unit}
         if len(both) == 2 and "unknown" not in both:

@@ -162,7 +162,7 @@ def judged(
         known = _usable(replace(repaired[0], effects=repaired[0].effects[:n_known]), judge)[0]
         for n in range(len(known.effects) + 1, len(model.effects) + 1):
             made = replace(model, effects=model.effects[:n])
-            rescaled = any(effect.unit_factor != 1.0 for effect in made.effects)
+            rescaled = any(effect.rescales for effect in made.effects)
             after, given = apart(drawn(made), None if rescaled else made.effects)
             effects.append(model.effects[n - 1])
             courses.append(float(after.mean()))

@@ -16,7 +16,7 @@ from gyrofuse.mismatch.mechanisms.catalogue import named
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, repaired
 from gyrofuse.mismatch.selection.alternatives import compare
 from gyrofuse.mismatch.selection.forward import Selected
-from gyrofuse.mismatch.selection.held_out import HeldOutScore, score_held_out
+from gyrofuse.mismatch.selection.held_out import HeldOutScore, score_beneath, score_held_out
 from gyrofuse.mismatch.signals.comparison import Comparison
 
 
@@ -162,7 +162,7 @@ def _left_out(one: Selected, later: Sequence[Finding], generator: torch.Generato
     if one.finding.effect.stage or not later:
         return one.score, one.before
     left = repaired(one.before, later, generator)
-    return score_held_out(left, one.finding.effect), left
+    return score_beneath(left, one.finding.effect, [f.effect for f in later], one.before), left
 
 
 def _repaired(

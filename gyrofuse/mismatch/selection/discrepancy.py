@@ -16,6 +16,7 @@ from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED, held_out_blocks
+from gyrofuse.mismatch.signals.records import Records
 from gyrofuse.wavelets.covariance import wavelet_cross_covariance
 
 _FARTHER = 1.5  # times the discrepancy: 587 arrays with effects that were repaired had at most 1.2
@@ -37,7 +38,9 @@ def discrepancy_of_fold(comparison: Comparison, fold: int) -> float:
         comparison: Recording and simulation; all blocks of the simulation are used, which give the variance as well.
         fold: Number of the fold, whose blocks of the recording are compared.
     """
-    blocks = _cut(held_out_blocks(comparison.recording, fold), _length(comparison))  # (sensor, block, piece, time)
+    blocks = _cut(
+        held_out_blocks(_steady(comparison.observed)[0], fold), _length(comparison)
+    )  # (sensor, block, piece, time)
     observed = _block_moments(blocks.flatten(1, 2))
     reference = _reference_moments(comparison)
     n_observed, n_reference = len(observed), len(reference)
@@ -61,7 +64,7 @@ class Differences(NamedTuple):
 
 def differences_of_fold(comparison: Comparison, fold: int) -> Differences:
     """Those of the blocks that a fold holds out."""
-    blocks = _cut(held_out_blocks(comparison.recording, fold), _length(comparison))
+    blocks = _cut(held_out_blocks(_steady(comparison.observed)[0], fold), _length(comparison))
     reference = _reference_moments(comparison)
     return Differences(_block_moments(blocks.flatten(1, 2)) - reference.mean(0), reference.var(0) / len(reference))
 
@@ -113,7 +116,7 @@ def discrepancy_left(comparison: Comparison, after: float) -> TestResult | None:
     if not after > EXPLAINED:
         return None
     moments = _reference_moments(comparison)
-    observed = _block_moments(_cut(comparison.recording, _length(comparison)))
+    observed = _block_moments(_cut(_steady(comparison.observed)[0], _length(comparison)))
     apart = (observed.mean(0) - moments.mean(0)).square() / moments.var(0)
     by_level = apart.view(_levels_of(_length(comparison)), -1).mean(-1)
     levels = tuple(int(j) + 1 for j in (by_level > by_level.max() / 2).nonzero()[:, 0])
@@ -151,9 +154,18 @@ def _without_lines(comparison: Comparison) -> Comparison:
 
 
 @derived
+def _steady(side: Records) -> Tensor:
+    """Records `(record, sensor, time)` without a course of the level that both sides are known to have.
+
+    Blocks of it are compared with those of all other times.
+    """
+    return side.steadied(side.signal)
+
+
+@derived
 def _reference_moments(comparison: Comparison) -> Tensor:
     """Moments of all blocks of the simulation, as long as those that are compared, `(block, moment)`."""
-    return _block_moments(_cut(comparison.reference.signal, _length(comparison))).flatten(0, 1)
+    return _block_moments(_cut(_steady(comparison.reference), _length(comparison))).flatten(0, 1)
 
 
 def _length(comparison: Comparison) -> int:

@@ -8,10 +8,12 @@ from typing import NamedTuple
 
 import torch
 
+from gyrofuse.mismatch.decisions import NATS_AS_GOOD
 from gyrofuse.mismatch.mechanisms.catalogue import AGAIN, STAGES
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, repaired
 from gyrofuse.mismatch.selection.discrepancy import leads_away
-from gyrofuse.mismatch.selection.held_out import HeldOutScore, score_held_out
+from gyrofuse.mismatch.selection.held_out import HeldOutScore, numbers_by_fold, score_held_out
+from gyrofuse.mismatch.selection.residue import is_left_of_form
 from gyrofuse.mismatch.signals.comparison import Comparison
 
 _MOST, _MOST_OF_A_KIND = 20, 6  # findings: a recording that needs more is another instrument
@@ -95,7 +97,10 @@ def _best_of_stage(
         finding = kind.detect_and_fit(comparison, level * kind.level_after_repairs if known else level)
         if finding is not None and not is_known(finding, known):
             found.append(finding)
-    for finding in sorted(found, key=lambda f: -f.gain):
+    # What follows a channel has a cause that is known to be there: of equals it comes first.
+    for finding in sorted(found, key=lambda f: -f.gain - NATS_AS_GOOD * (f.channel is not None)):
+        if selected and finding.effect.of_spectra and is_left_of_form(finding.effect, start, comparison):
+            continue
         score = _held(finding, finding.effect, start, comparison, generator)
         if score is None:
             score = _held_in_company(finding, start, comparison, generator)
@@ -108,7 +113,9 @@ def _held(
     finding: Finding, effect: Mechanism, start: Comparison, comparison: Comparison, generator: torch.Generator
 ) -> HeldOutScore | None:
     """Score of a finding's effect on the blocks held out; None where it does not hold there, or leads away."""
-    score = score_held_out(comparison, effect)
+    score, steady = score_held_out(comparison, effect), 0.2  # share of the record in which what never changes is seen
+    if effect.of_spectra and score.share_of_record < steady:  # what a pulse left, or an episode
+        return None
     if score.confirms(finding.p_value) and not leads_away(start, comparison, score.by_fold, generator):
         return score
     return None
@@ -121,9 +128,13 @@ def _held_in_company(
     alone, company = finding.effect.with_company(comparison)
     if not company:
         return None
-    score = _held(finding, alone, start, repaired(comparison, company, generator), generator)
+    beneath, beside = finding.effect.beneath(company, comparison), repaired(comparison, company, generator)
+    judged = alone if beneath is finding.effect else beneath
+    score = _held(finding, judged, start, beside, generator)
     if score is None:
         return None
+    if judged is beneath:
+        score = score._replace(by_fold=numbers_by_fold(comparison, finding.effect))
     gained, beside = 0.0, finding.effect.repair(comparison, generator)
     for effect in company:
         gained += score_held_out(beside, effect).total

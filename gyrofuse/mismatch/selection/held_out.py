@@ -44,6 +44,12 @@ class HeldOutScore(NamedTuple):
         """Standard deviation of the total, from the scatter of the blocks."""
         return sd_of_sum(self.blocks)
 
+    @property
+    def share_of_record(self) -> float:
+        """Share of the blocks that gain, by their effective number."""
+        gained = self.blocks.clamp(min=0)
+        return float(gained.sum().square() / gained.square().sum().clamp(min=1e-300)) / len(gained)
+
     def confirms(self, p_value: float) -> bool:
         """Whether a finding of that p value holds on the blocks held out (the rule of one standard error).
 
@@ -120,12 +126,33 @@ def score_held_out(comparison: Comparison, effect: Mechanism) -> HeldOutScore:
         comparison: Recording and simulation in which the mechanism was found.
         effect: Mechanism with its numbers.
     """
-    by_fold = tuple(effect.fit_without(comparison, fold) for fold in range(N_FOLDS))
+    by_fold = numbers_by_fold(comparison, effect)
     blocks = torch.empty(N_JUDGED, dtype=torch.float64)
     for fold, one in enumerate(by_fold):
         blocks[in_fold(N_JUDGED, fold)] = one.held_out_scores(comparison, fold)
     in_sample = sum(float(effect.held_out_scores(comparison, fold).sum()) for fold in range(N_FOLDS))
     return HeldOutScore(effect.likelihood, blocks, by_fold, in_sample)
+
+
+def numbers_by_fold(comparison: Comparison, effect: Mechanism) -> tuple[Mechanism, ...]:
+    """A mechanism with the numbers that each fold leaves."""
+    return tuple(effect.fit_without(comparison, fold) for fold in range(N_FOLDS))
+
+
+def score_beneath(
+    comparison: Comparison, effect: Mechanism, later: Sequence[Mechanism], before: Comparison
+) -> HeldOutScore:
+    """The same where later mechanisms are applied already, with the numbers of each fold without them.
+
+    Args:
+        comparison: Recording and simulation with the later ones.
+        effect: Mechanism with its numbers.
+        later: The later ones.
+        before: Recording and simulation without them.
+    """
+    judged = effect.beneath(later, before)
+    score = score_held_out(comparison, judged)
+    return score if judged is effect else score._replace(by_fold=numbers_by_fold(before, effect))
 
 
 def agreement(start: Comparison, scores: Sequence[HeldOutScore], generator: torch.Generator) -> HeldOut:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import torch
 
+from gyrofuse._base.checks import repeatable_generator
 from gyrofuse.fitting.gmwm_result import GMWMResult
 from gyrofuse.io.recording import Recording
 from gyrofuse.mismatch.diagnose import diagnose
@@ -48,10 +49,16 @@ def diagnose_board(
         Causes, and the diagnosis of each group.
 
     Raises:
-        TypeError: What `diagnose` refuses.
+        TypeError: No mapping, or what `diagnose` refuses.
         ValueError: No group, other groups among simulations or judges, or what `diagnose` refuses of a group, with its
             name.
     """
+    for name, given in (("recordings", recordings), ("simulations", simulations), ("judges", judges)):
+        if given is not None and not isinstance(given, Mapping):
+            raise TypeError(
+                f"`{name}`: expected a mapping from the names of groups, such as 'rate' and 'acceleration', got "
+                f"{type(given).__name__}; use `diagnose` for a single group"
+            )
     if not recordings:
         raise ValueError("`recordings`: expected one group of sensors or more, got none")
     for name, other in (("simulations", simulations), ("judges", judges)):
@@ -59,8 +66,7 @@ def diagnose_board(
             raise ValueError(
                 f"`{name}`: expected the groups {', '.join(recordings)} of the recordings, got {', '.join(other)}"
             )
-    if generator is None:
-        generator = torch.Generator().manual_seed(0)
+    generator = repeatable_generator(generator)
     reports = {}
     for k, (name, recording) in enumerate(recordings.items()):
         simulation = simulations[name]

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from gyrofuse._base.checks import same_rate
+from gyrofuse._base.checks import repeatable_generator, same_rate
 from gyrofuse.io.recording import Recording
 from gyrofuse.mismatch.diagnose import diagnose
 from gyrofuse.mismatch.repair.inputs import Simulation, modelled, on_processor
@@ -51,9 +51,13 @@ def diagnose_sessions(
         Causes with their scope, the diagnosis of each recording, and a simulation that draws sessions.
 
     Raises:
-        TypeError: Recordings of different kinds, or what `diagnose` refuses.
+        TypeError: A single recording, recordings of different kinds, or what `diagnose` refuses.
         ValueError: Fewer than two recordings, recordings that do not fit each other, or what `diagnose` refuses.
     """
+    if isinstance(recordings, Recording | Tensor):
+        raise TypeError(
+            f"`recordings`: expected a sequence of two or more, got one {type(recordings).__name__}; use `diagnose`"
+        )
     recordings = list(recordings)
     if len(recordings) < 2:
         raise ValueError(
@@ -62,8 +66,7 @@ def diagnose_sessions(
     names = tuple(names) or tuple(map(str, range(1, len(recordings) + 1)))
     if len(names) != len(recordings):
         raise ValueError(f"`names`: expected {len(recordings)}, one of each recording, got {len(names)}")
-    if generator is None:
-        generator = torch.Generator().manual_seed(0)
+    generator = repeatable_generator(generator)
     recordings = [on_processor(_fitting(one, recordings[0], name)) for one, name in zip(recordings, names, strict=True)]
     if judge is not None:
         judge = checked_judge(on_processor(judge), recordings[0], rate)

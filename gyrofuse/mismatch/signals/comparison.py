@@ -63,7 +63,8 @@ class Comparison:
 
     Attributes:
         info: Rate, unit, names, auxiliary channels.
-        observed: The recording, one record, without what was taken off it.
+        as_came: The recording, one record: the values that its converter gave.
+        observed: The same without what was taken off it.
         reference: The simulation, with what was built into it: records as long as the recording, or a single shorter
             one.
         analog: The simulation's samples `(record, sensor, time)` before the converter; where they came rounded, as
@@ -77,6 +78,7 @@ class Comparison:
     """
 
     info: RecordingInfo
+    as_came: Records
     observed: Records
     reference: Records
     analog: Tensor
@@ -89,12 +91,18 @@ class Comparison:
     def of(cls, info: RecordingInfo, recording: Tensor, simulation: Tensor) -> Comparison:
         """A case of a recording `(sensor, time)` and a simulation `(record, sensor, time)`."""
         both = bands(recording.shape[-1])
-        return cls(info, Records(recording[None], both), Records(simulation, both), simulation)
+        came = Records(recording[None], both)
+        return cls(info, came, came, Records(simulation, both), simulation)
 
     @property
     def recording(self) -> Tensor:
         """`(sensor, time)`, without what was taken off it."""
         return self.observed.signal[0]
+
+    @property
+    def taken_off(self) -> Tensor:
+        """What was taken off the recording, `(sensor, time)`."""
+        return self.as_came.signal[0] - self.recording
 
     @property
     def bands(self) -> Bands:
@@ -186,8 +194,22 @@ class Comparison:
         )
         reference = torch.where(hidden, analog, self.reference.signal)
         converter = tuple((place, partial(_but_for, act, hidden)) for place, act in self.converter)
-        sides = replace(self.observed, signal=observed), replace(self.reference, signal=reference)
-        return replace(self, observed=sides[0], reference=sides[1], analog=analog, converter=converter)
+        came = torch.where(hidden, observed, self.as_came.signal)
+        return replace(
+            self,
+            as_came=replace(self.as_came, signal=came),
+            observed=replace(self.observed, signal=observed),
+            reference=replace(self.reference, signal=reference),
+            analog=analog,
+            converter=converter,
+        )
+
+    def without_converter(self, place: int, sensors: Sequence[int]) -> Comparison:
+        """Without what the simulation's converter does to some sensors at a place in the chain."""
+        spared = torch.zeros(self.n_sensors, 1, dtype=torch.bool)
+        spared[list(sensors)] = True
+        converter = tuple((at, partial(_but_for, act, spared) if at == place else act) for at, act in self.converter)
+        return replace(self, converter=converter).apply(lambda signal: signal)
 
     def apply(self, act: Callable[[Tensor], Tensor], place: int = 0) -> Comparison:
         """With something that acts on the simulation's samples, after what has a lower place in the chain.

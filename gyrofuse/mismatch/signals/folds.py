@@ -14,6 +14,7 @@ from torch import Tensor
 
 from gyrofuse._base.transforms import cosine_ordinates
 from gyrofuse.mismatch.signals.comparison import Comparison
+from gyrofuse.mismatch.signals.known_lines import without_lines
 from gyrofuse.mismatch.signals.lines import whitened
 
 N_JUDGED = 32  # blocks
@@ -51,7 +52,7 @@ def spectral_gains(
     The likelihood of cosine transforms, whose ordinates are independent for white noise and random walks. They are
     real: noise that sensors share a quarter of a cycle apart does not count. Blocks are short: next to a filter's edge,
     in its stop band and at its zeros most of an ordinate's power is what leaks in from elsewhere, so that spectra are
-    seen as a block shows them.
+    seen as a block shows them. Lines that the simulation has as well are no noise.
 
     Args:
         comparison: Recording and simulation without the mechanism.
@@ -68,7 +69,9 @@ def spectral_gains(
     plain = torch.diag_embed(noise.mT).to(torch.complex128)
     simulated = plain if before is None else before(plain, f)
     after, without = (seen_in_block(matrices.real)[_FIRST:] for matrices in (spectra(plain, f), simulated))
-    return _log_scores(left, after, fold) - _log_scores(comparison.recording, without, fold)
+    came = comparison.observed.noise[0]
+    own = came if left is comparison.recording else without_lines(left, comparison.observed.lines)
+    return _log_scores(own, after, fold) - _log_scores(came, without, fold)
 
 
 def seen_in_block(spectra: Tensor) -> Tensor:

@@ -89,7 +89,7 @@ def strongest_line(observed: Records, reference: Records) -> FoundLine:
 
 
 def _as_faint(f: float, observed: Records, reference: Records) -> bool:
-    """Whether a line stands out in the simulation as well, though not in all of its spectrum, half as large or larger.
+    """Whether a line stands out in the simulation as well, though not in all of its spectrum, and is about as large.
 
     Two faint ones, of which by chance one is below what is seen among all frequencies, are no difference.
     """
@@ -100,7 +100,10 @@ def _as_faint(f: float, observed: Records, reference: Records) -> bool:
         for line, log_p in zip(lines.frequency, lines.log_p.tolist(), strict=True)
         if log_p < math.log(CERTAIN) and abs(float(line) - f) < near
     ]
-    return bool(_shared(tuple(there[:1]), observed, reference))
+    if not there:
+        return False
+    own, others = _powers(tuple(there[:1]), observed, reference)
+    return bool(others / 4 < own) and bool(own < 4 * others)
 
 
 def _shared(lines: tuple[float, ...], observed: Records, reference: Records) -> list[float]:
@@ -110,9 +113,14 @@ def _shared(lines: tuple[float, ...], observed: Records, reference: Records) -> 
     """
     if not lines:
         return []
+    own, others = _powers(lines, observed, reference)
+    return [f for f, yes in zip(lines, (own > others / 4).tolist(), strict=True) if yes]
+
+
+def _powers(lines: tuple[float, ...], observed: Records, reference: Records) -> tuple[Tensor, Tensor]:
+    """Of lines on both sides, mean of their records, `(line,)`."""
     own, others = (amplitudes(side.signal, lines).square().mean(0).sum(0) for side in (observed, reference))
-    there = own > others / 4
-    return [f for f, yes in zip(lines, there.tolist(), strict=True) if yes]
+    return own, others
 
 
 @derived

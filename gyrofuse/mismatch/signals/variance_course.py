@@ -107,11 +107,18 @@ def _mean_share(corner: float) -> float:
 
 
 def corner_of(noise: Tensor, inside: Tensor, factor: Tensor) -> float:
-    """Frequency from which on noise is louder, cycles per sample.
+    """Frequency from which on noise is louder, cycles per sample: of the likely ones that nearest to a 64th.
 
-    By least squares of log spectra of the longest stretch inside over that outside, over powers of two. Of those within
-    4 of the least chi-square, 2 sd, it is the one nearest to a 64th; that is the value of stretches of less than 256
-    samples as well.
+    Arguments as of `likely_corners`.
+    """
+    return likely_corners(noise, inside, factor)[0]
+
+
+def likely_corners(noise: Tensor, inside: Tensor, factor: Tensor) -> list[float]:
+    """Frequencies from which on noise may be louder, cycles per sample, that nearest to a 64th first.
+
+    By least squares of log spectra of the longest stretch inside over that outside, over powers of two: those within 4
+    of the least chi-square, 2 sd. A 64th where a stretch has less than 256 samples.
 
     Args:
         noise: Noise, `(sensor, time)`.
@@ -121,7 +128,7 @@ def corner_of(noise: Tensor, inside: Tensor, factor: Tensor) -> float:
     parts = [_longest(inside), _longest(~inside)]
     lengths = [b - a for a, b in parts]
     if min(lengths) < 256:
-        return max(_CORNER, 1 / len(inside))
+        return [max(_CORNER, 1 / len(inside))]
     wanted = bands(lengths[0])
     powers = [cross_spectra(noise[None, :, a:b], wanted)[0].diagonal(dim1=-1, dim2=-2).real.mT for a, b in parts]
     ratio = (powers[0] / powers[1]).log()
@@ -135,7 +142,7 @@ def corner_of(noise: Tensor, inside: Tensor, factor: Tensor) -> float:
 
     tried = {k: misfit(2.0**-k) for k in range(4, math.ceil(math.log2(len(inside))) + 1)}
     good = [k for k, chi2 in tried.items() if chi2 <= min(tried.values()) + 4.0]
-    return 2.0 ** -min(good, key=lambda k: abs(k + math.log2(_CORNER)))
+    return [2.0**-k for k in sorted(good, key=lambda k: abs(k + math.log2(_CORNER)))]
 
 
 def _longest(where: Tensor) -> tuple[int, int]:

@@ -74,6 +74,8 @@ def make_case(
     root = np.random.SeedSequence([seed, zlib.crc32(kind.encode()), round(1000 * (nats or 0))])
     of_base, of_effect, of_recording, of_simulation, of_table, of_setting = map(np.random.default_rng, root.spawn(6))
     setting = drawn(n_samples, of_setting) if wide else Setting(n_samples, rate)
+    if wide and made.option("of_record"):
+        setting = setting._replace(reach="all")
     asked, n_samples, rate = {"n_samples": n_samples, "rate": rate, "wide": wide}, setting.n_samples, setting.rate
     real = None
     if made.group == "real":

@@ -193,6 +193,32 @@ def two_time_constants(bench: Bench, nats: float) -> Part:
     )
 
 
+def heater(bench: Bench, nats: float) -> Part:
+    """Something is switched on while it records, and heats the device."""
+    onset, tau = bench.duration * bench.rng.uniform(0.1, 0.7), bench.duration * bench.rng.uniform(0.03, 0.1)
+    since = np.clip(np.arange(bench.n) / bench.rate - onset, 0, None)
+    course = -np.expm1(-since / tau)
+    part, _ = bench.shape("warm_up_transient", nats, bench.gains(bench.some_sensors())[:, None] * course, time_s=onset)
+    assert part.signal is not None
+    return replace(part, look_alikes=bench.rivals(part.signal, {"step": shapes.steps(bench)}), form="switched on late")
+
+
+def thermal_loop(bench: Bench, nats: float) -> Part:
+    """A bias with a share of the temperature and one of its rate of change, in every sensor others."""
+    sensors = bench.some_sensors()
+    inside = thermal.box(thermal.room(bench.n, bench.rate, bench.rng), bench.rate, bench.rng.uniform(3, 15), 20.0)
+    late = thermal.lagged(inside, 0.03 * bench.n, float(inside[0]))
+    parts = [(x - x.mean()) / np.std(x) for x in (inside, inside - late)]
+    unit = sum(bench.gains(sensors)[:, None] * x for x in parts)
+    part, _ = bench.shape(
+        "temperature_drift", nats, np.asarray(unit), known=True,
+        channel="temperature", channels={"temperature": thermal.thermometer(inside, bench.rng)},
+    )  # fmt: skip
+    assert part.signal is not None
+    courses = {"step": shapes.steps(bench), "warm_up_transient": shapes.warm_ups(bench)}
+    return replace(part, look_alikes=bench.rivals(part.signal, courses), form="a loop")
+
+
 def ramp_of_level(bench: Bench, nats: float) -> Part:
     """Noise that grows louder, or fades, along the record or a part of it."""
     sensors = bench.some_sensors()
@@ -201,6 +227,20 @@ def ramp_of_level(bench: Bench, nats: float) -> Part:
         start, stop = 0.0, 1.0
     course = np.clip((np.arange(bench.n) / bench.n - start) / (stop - start), 0, 1) * bench.rng.choice([-1.0, 1.0])
     return replace(noise_of_level(bench, "variance_change", nats, sensors, course), form="ramp")
+
+
+def level_of_channel(bench: Bench, nats: float) -> Part:
+    """Noise that is louder the more a motor is asked for, whose command is a channel: steps, or a course of its own."""
+    sensors = bench.some_sensors()
+    changes = np.sort(bench.rng.integers(0, bench.n, int(bench.rng.integers(8, 40))))
+    if bench.rng.uniform() < 0.5:
+        levels = bench.rng.uniform(0, 1, len(changes) + 1)
+        command = levels[np.searchsorted(changes, np.arange(bench.n), side="right")]
+    else:
+        t = np.arange(bench.n) / bench.n
+        command = 0.5 + 0.5 * np.sin(2 * np.pi * (bench.rng.uniform(1, 6) * t + bench.rng.uniform()))
+    part = noise_of_level(bench, "variance_change", nats, sensors, command)
+    return replace(part, form="of a channel", channel="motor_command", channels={"motor_command": command})
 
 
 def several_modes(bench: Bench, nats: float) -> Part:

@@ -64,6 +64,7 @@ _MECHANISMS: dict[str, Callable[[Bench, float], Part]] = {
     "channel_coupling": shapes.channel_coupling,
     "clock_skew": shapes.clock_skew,
     "clock_lost_samples": _with(shapes.clock_skew, lost=True),
+    "time_scale": shapes.time_scale,
     "parameter_shift": spectral.parameter_shift,
 }
 
@@ -137,8 +138,11 @@ _FORMS: dict[str, Callable[[Bench, float], Part]] = {
     "bursts_of_a_tone": forms.bursts_of_a_tone,
     "curved_temperature": forms.curved_temperature,
     "two_time_constants": forms.two_time_constants,
+    "heater": forms.heater,
+    "thermal_loop": forms.thermal_loop,
     "asymmetric_telegraph": _with(spectral.random_telegraph, asymmetries=(2.2, 3.2)),
     "ramp_of_level": forms.ramp_of_level,
+    "level_of_channel": forms.level_of_channel,
     "several_steps": _with(shapes.step, count=3),
     "several_modes": forms.several_modes,
     "late_acceleration": forms.late_acceleration,
@@ -169,11 +173,15 @@ _REAL: dict[str, tuple[Callable[[Bench, float], Part], ...]] = {
     "spikes": (_with(marginal.spikes, simultaneous=False),),
 }
 
+_LINE = ("line", True)  # that all sensors share and the simulator knows
+_ON_THE_TABLE: dict[str, tuple[tuple[str, Any], ...]] = {
+    "clock_skew": (_LINE,),
+    "clock_lost_samples": (_LINE,),
+    "time_scale": (_LINE, ("of_record", True)),  # the label is the record's: no sensor has a rate of its own
+}
+
 KINDS: dict[str, Kind] = {
-    **{
-        name: Kind("mechanism", (effect,), (("line", True),) if name.startswith("clock") else ())
-        for name, effect in _MECHANISMS.items()
-    },
+    **{name: Kind("mechanism", (effect,), _ON_THE_TABLE.get(name, ())) for name, effect in _MECHANISMS.items()},
     **{name: Kind("null", (), tuple(options.items())) for name, options in _NULLS.items()},
     **{f"pair:{name}": Kind("pair", (e,), tuple(o.items())) for name, (e, o) in _PAIRS.items()},
     **{f"two:{name}": Kind("two", tuple(_MECHANISMS[part] for part in parts)) for name, parts in _COMBINED.items()},

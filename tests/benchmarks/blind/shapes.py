@@ -469,6 +469,27 @@ def clock_skew(bench: Bench, nats: float, *, lost: bool = False) -> Part:
     )
 
 
+def time_scale(bench: Bench, nats: float) -> Part:
+    """The recording's rate is not the one on its label: lines of the simulator are all there, a factor off."""
+    ratio = 1 + float(bench.rng.choice([-1.0, 1.0])) * bench.rng.uniform(0.01, 0.1)
+    known = bench.rng.uniform(0.05, 0.2), bench.rng.uniform(0.24, 0.4)
+    t = np.arange(bench.n)
+    lines = sum(np.cos(2 * np.pi * (ratio * nu * t + bench.rng.uniform())) for nu in known)
+    part, amplitude = bench.shape("time_scale", nats, np.ones((bench.n_sensors, 1)) * lines)
+    assert part.signal is not None
+
+    def with_lines(simulated: Array) -> Array:
+        return simulated + sum(common_line(simulated.shape[-1], nu, amplitude, bench.rng) for nu in known)
+
+    return replace(
+        part,
+        look_alikes=("vibration_tone", "clock_skew"),
+        frequency_hz=ratio * known[0] * bench.rate,
+        simulation=with_lines,
+        parameters={"ratio": quantity(ratio, "")},
+    )
+
+
 def common_line(n: int, nu: float, amplitude: float, rng: np.random.Generator) -> Array:
     """A line that all sensors share, `nu` in cycles per sample, its phase drawn."""
     return amplitude * np.cos(2 * np.pi * (nu * np.arange(n) + rng.uniform()))

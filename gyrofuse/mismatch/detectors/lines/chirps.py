@@ -6,6 +6,9 @@ Gamma, corrected for the tracks searched (`tracks`).
 
 from __future__ import annotations
 
+import itertools
+import math
+
 import torch
 from torch import Tensor
 
@@ -18,6 +21,7 @@ from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.prediction_errors import ENDS, left_out
 from gyrofuse.mismatch.signals.records import Records
+from gyrofuse.mismatch.stats.level_scan import local_level
 
 
 def chirp_test(comparison: Comparison) -> TestResult:
@@ -67,15 +71,30 @@ def _strongest(side: Records) -> Sweep:
 
 
 def decorrelated_record(side: Records) -> Tensor:
-    """Whitened record `(sensor, time)` without the coherence of broad bands."""
+    """Whitened record `(sensor, time)` of a steady level, without the coherence of broad bands."""
+    # Standard deviations, and samples beyond: pulses and spikes have all frequencies, also those of a line that moves.
+    far, many = 4.5, 8
     white = left_out(side).white[0]
+    white = white / local_level(white).sqrt()
+    off = white.abs() > far
+    white = torch.where(off, 0.0, white)
     n = white.shape[-1]
     transform = torch.fft.rfft(white)
     edges = [0, *(round(e * n / side.bands.n_samples) for e in side.bands.edges[1:-1]), transform.shape[-1]]
-    transform = decorrelated(transform, edges, side.dof)
+    transform = decorrelated(transform / math.sqrt(n), edges, side.dof)
+    transform = torch.where(off.sum(-1, keepdim=True) > many, _level(transform, edges), transform)
     white = torch.fft.irfft(transform, n=n)
     white = white / white.square().mean(-1, keepdim=True).sqrt()
     # Beside lines the ends mirror what is next to them: counted twice, chance would be significant.
     end = n // ENDS
     white[:, :end], white[:, -end:] = 0.0, 0.0
     return white
+
+
+def _level(transform: Tensor, edges: list[int]) -> Tensor:
+    """A transform `(sensor, bin)` of the same level in all bands, where one was whitened with what was far off."""
+    fewest, parts = 64, []  # bins, for a median that is known to a fifth
+    for part in transform.split([b - a for a, b in itertools.pairwise(edges)], -1):
+        usual = part.abs().median(-1, keepdim=True).values.clamp(min=1e-300) / math.sqrt(math.log(2))
+        parts.append(part / usual if part.shape[-1] >= fewest else part)
+    return torch.cat(parts, -1)

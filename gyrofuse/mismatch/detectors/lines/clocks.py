@@ -20,6 +20,14 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.decisions import CERTAIN, NATS_AS_GOOD
+from gyrofuse.mismatch.detectors.lines.demodulation import (
+    BLOCKS,
+    best_slope,
+    demodulated,
+    energy_by_slope,
+    slope_variance,
+    turn_by,
+)
 from gyrofuse.mismatch.detectors.lines.lost_samples import Loss, losses_of, paths_of, put_back
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.signals.comparison import Comparison
@@ -28,9 +36,8 @@ from gyrofuse.mismatch.signals.known_lines import without_lines
 from gyrofuse.mismatch.signals.lines import sets_of, simulated_lines, whitened
 from gyrofuse.mismatch.stats.multiplicity import e_value_of, p_value_from_e_value
 
-BLOCKS = 512  # in which a tone is demodulated: a loss is placed to one, then to the sample
 SIMULATION = "the simulation"  # as the reference of a clock
-_CYCLES, _FINER = 4, 32  # slopes of the phase that are searched, cycles over the record, and steps of one cycle
+_IN_PHASE = 0.9  # share of a tone's power that has one phase: a tenth may be something else
 
 
 @dataclass(frozen=True)
@@ -111,30 +118,38 @@ def strongest_slip(comparison: Comparison) -> Slip | None:
     """The most likely slip of any tone that the recording shares with the simulation, or that is new and steady."""
     block = comparison.n_samples // BLOCKS
     lines, found = simulated_lines(comparison.reference), comparison.line
-    tones = [f for f in lines if f * block >= 1 and not _rings(comparison, f)]  # a cycle in a block, or more
-    tones = [f for f in tones if not _elsewhere(comparison, f)][:3]
+    shared = [f for f in lines if f * block >= 1 and not _rings(comparison, f)]  # a cycle in a block, or more
+    tones = [f for f in shared if not _elsewhere(comparison, f)][:3]
     if found.p_value < CERTAIN and found.frequency * block >= 1 and _steady(comparison, found.frequency):
         tones.append(found.frequency)
-    if not tones:
+    simulated = [slip for f in shared[:3] if (slip := _from_simulated(comparison, f)) is not None]
+    if not tones and not simulated:
         return None
     apart = 4 / comparison.n_samples  # a tone that fades is wider than a bin, and its skirts are no other lines
     slips = [slip for f in tones for slip in _of_tone(comparison, f, tuple(o for o in lines if abs(o - f) > apart))]
-    slips += [slip for f in tones if f in lines and (slip := _from_simulated(comparison, f)) is not None]
-    best = max(slips, key=lambda slip: slip.log_ratio, default=None)
-    return None if best is None else replace(best, log_ratio=best.log_ratio - math.log(2 * len(tones)))
+    best = max([*slips, *simulated], key=lambda slip: slip.log_ratio, default=None)
+    return None if best is None else replace(best, log_ratio=best.log_ratio - math.log(2 * len({*tones, *shared[:3]})))
 
 
 def _from_simulated(comparison: Comparison, f: float) -> Slip | None:
-    """All sensors together against a tone of the simulation, which they have in one phase but for a slope."""
+    """All sensors together against a tone of the simulation, which they have in one phase but for a slope or steps."""
     observed = demodulated(comparison.white, f)
     simulated = demodulated(whitened(comparison.reference.signal[0], comparison.base), f)
     power, energy = _power_and_energy(observed)
     (slope, size), (other, their_size) = best_slope(observed), best_slope(simulated)
-    if float(energy.sum()) < 0.9 * float(power.clamp(min=0).sum()) or min(size, their_size) < 2 * NATS_AS_GOOD:
-        return None
     length = comparison.n_samples // BLOCKS * BLOCKS
     same = comparison.reference.signal.shape[-1] / comparison.n_samples  # of another length: slopes are over the record
-    variance = _variance(size) + _variance(their_size) / same**2
+    if min(size, their_size) < 2 * NATS_AS_GOOD:
+        return None
+    whole, straight = float(power.clamp(min=0).sum()), float(energy.sum())
+    if straight < whole - 2 * NATS_AS_GOOD:  # steps may be better
+        turned = observed * turn_by(-other / same)
+        steps = _lost_by_all(turned, f + other / same / length, length // BLOCKS, straight + NATS_AS_GOOD)
+        if steps is not None:
+            return steps
+    if straight < _IN_PHASE * whole:
+        return None
+    variance = slope_variance(size) + slope_variance(their_size) / same**2
     z = (slope - other / same) / math.sqrt(variance)
     scale = 1 / (f * length)
     return Slip(
@@ -150,6 +165,25 @@ def _from_simulated(comparison: Comparison, f: float) -> Slip | None:
     )
 
 
+def _lost_by_all(z: Tensor, f: float, block: int, least: float) -> Slip | None:
+    """Samples that all sensors lost at once, each by itself in one phase again once these are put back.
+
+    Args:
+        z: Tone of the sensors against that of the simulation, demodulated, `(sensor, block)`.
+        f: Its frequency, cycles per sample.
+        block: Samples of a block.
+        least: Energy in one phase that has to be surpassed, nats.
+    """
+    angle = 2 * math.pi * f
+    fit = _lost(z, torch.ones(1, len(z), dtype=torch.float64), torch.zeros(1, dtype=torch.float64), angle, fixed=True)
+    back = put_back(z, {loss.at: loss.count for loss in fit.losses}, angle)
+    in_phase, whole = float(back.sum(-1).abs().square().sum()) / BLOCKS, float(z.abs().square().sum()) - z.numel()
+    if not fit.losses or in_phase < max(_IN_PHASE * whole, least):
+        return None
+    losses = tuple(_in_samples(loss, block) for loss in fit.losses)
+    return Slip(f, tuple(range(len(z))), 0.0, 0.0, losses, fit.lost, fit.gain, fit.log_ratio, SIMULATION)
+
+
 def _elsewhere(comparison: Comparison, f: float) -> bool:
     """Whether what is near a line of the simulation has its phase in no sensor: it is a line of another frequency."""
     power, energy = _power_and_energy(demodulated(comparison.white, f))
@@ -157,43 +191,20 @@ def _elsewhere(comparison: Comparison, f: float) -> bool:
 
 
 def _steady(comparison: Comparison, f: float) -> bool:
-    """Whether a line is a tone of one phase in every sensor that has it, but for a slope: that of noise wanders.
-
-    A tenth of its power may be something else.
-    """
+    """Whether a line is a tone of one phase in every sensor that has it, but for a slope: that of noise wanders."""
     power, energy = _power_and_energy(demodulated(comparison.white, f))
     has = power > NATS_AS_GOOD + power.max() / 100
-    return bool((energy > 0.9 * power)[has].all()) and int(has.sum()) > 1
+    return bool((energy > _IN_PHASE * power)[has].all()) and int(has.sum()) > 1
 
 
 def _power_and_energy(z: Tensor) -> tuple[Tensor, Tensor]:
     """Power of rows `(row, block)` above noise, and what a phase with the best slope has of it, `(row,)`."""
-    return z.abs().square().sum(-1) - BLOCKS, _energy(z).amax(-1)
+    return z.abs().square().sum(-1) - BLOCKS, energy_by_slope(z).amax(-1)
 
 
 def _rings(comparison: Comparison, f: float) -> bool:
     """Whether a line of the simulation lies on a mode that was found: noise, whose phase is no clock."""
     return any(abs(f - centre) < 4 * (width + 1 / comparison.n_samples) for centre, width in comparison.modes)
-
-
-def demodulated(signal: Tensor, f: float) -> Tensor:
-    """Complex amplitudes of a tone in blocks of signals, in units of their noise, `(row, block)`.
-
-    Args:
-        signal: Whitened signals, `(row, time)`.
-        f: Frequency of the tone, cycles per sample.
-    """
-    block = signal.shape[-1] // BLOCKS
-    t = torch.arange(block * BLOCKS, dtype=torch.float64)
-    angle = 2 * math.pi * f * t
-    z = torch.complex(signal[:, : len(t)] * angle.cos(), -signal[:, : len(t)] * angle.sin())
-    z = z.unflatten(-1, (BLOCKS, block)).mean(-1)
-    # Least squares of both quadratures: in a block they are not orthogonal.
-    image = torch.polar(torch.ones_like(t), -2 * angle).unflatten(-1, (BLOCKS, block)).mean(-1)
-    z = (z - z.conj() * image) / (1 - image.abs().square())
-    # Squares of differences of complex normal noise are exponential; steps of a loud tone hardly move their median.
-    noise = z.diff().abs().square().median(-1, keepdim=True).values / (2 * math.log(2))
-    return z / noise.sqrt().clamp(min=1e-300)
 
 
 def _course(z: Tensor) -> Tensor:
@@ -233,16 +244,6 @@ def _back_from_wander(z: Tensor) -> Tensor:
     return turn if bool((gained > 2 * by_chance + NATS_AS_GOOD)[loud].all()) else torch.ones_like(turn)
 
 
-def best_slope(z: Tensor) -> tuple[float, float]:
-    """Slope of the phase of demodulated rows `(row, block)`, cycles over the record, and the tone's energy, nats."""
-    energy = _energy(z).sum(0)
-    at = int(energy[1:-1].argmax()) + 1
-    left, here, right = energy[at - 1 : at + 2].tolist()
-    bend = left - 2 * here + right
-    offset = (left - right) / (2 * bend) if bend < 0 else 0.0
-    return float(_slopes()[at]) + max(min(offset, 1.0), -1.0) / _FINER, here
-
-
 def _of_tone(comparison: Comparison, f: float, others: tuple[float, ...]) -> list[Slip]:
     """A skew and a loss of samples, as a tone of about `f` cycles per sample shows them, beside other ones."""
     z = demodulated(
@@ -251,11 +252,11 @@ def _of_tone(comparison: Comparison, f: float, others: tuple[float, ...]) -> lis
     z = z * _course(z)
     z = z * _back_from_wander(z)
     length = comparison.n_samples // BLOCKS * BLOCKS
-    found = _reference(comparison, f, float(_energy(z).amax()))
+    found = _reference(comparison, f, float(energy_by_slope(z).amax()))
     if found is None and len(z) < 2:
         return []
-    name, slope, slope_variance = found or (None, 0.0, 0.0)
-    z = z * _turn(-slope)
+    name, slope, of_reference = found or (None, 0.0, 0.0)
+    z = z * turn_by(-slope)
     sets, log_chance = sets_of(len(z))
     if name is None:  # by convention the smaller part slips
         small = sets.sum(-1) <= len(z) / 2
@@ -277,7 +278,7 @@ def _of_tone(comparison: Comparison, f: float, others: tuple[float, ...]) -> lis
                 tone,
                 tuple(inside.nonzero()[:, 0].tolist()),
                 fit.slope * scale,
-                0.0 if fit.losses else math.sqrt(fit.variance + slope_variance) * scale,
+                0.0 if fit.losses else math.sqrt(fit.variance + of_reference) * scale,
                 tuple(_in_samples(loss, length // BLOCKS) for loss in fit.losses),
                 fit.lost,
                 fit.gain,
@@ -291,7 +292,7 @@ def _of_tone(comparison: Comparison, f: float, others: tuple[float, ...]) -> lis
 def _with_the_like(z: Tensor, inside: Tensor, fit: _Fit) -> tuple[Tensor, float]:
     """A set of sensors `(sensor,)` with all others whose tone the same slip explains, and the nats that these gain."""
     lost = {loss.at: loss.count for loss in fit.losses}
-    back = put_back(z, lost, fit.angle) if lost else z * _turn(-fit.slope)
+    back = put_back(z, lost, fit.angle) if lost else z * turn_by(-fit.slope)
     gains = (back.sum(-1).abs().square() - z.sum(-1).abs().square()) / BLOCKS
     more = ~inside & (gains > math.log(len(z)) + NATS_AS_GOOD)
     return inside | more, float(gains[more].sum())
@@ -312,13 +313,13 @@ def _reference(comparison: Comparison, f: float, strongest: float) -> tuple[str,
             continue
         slope, energy = best_slope(demodulated(rows, f))
         if energy > 10 * strongest:  # its phase is known well beside that of any sensor
-            best, strongest = (name, slope, _variance(energy)), energy / 10
+            best, strongest = (name, slope, slope_variance(energy)), energy / 10
     return best
 
 
 def _skewed(z: Tensor, sets: Tensor, log_chance: Tensor, *, fixed: bool) -> _Fit:
     """The most likely set of sensors with a skew, against a reference that is fixed or the other sensors."""
-    energy = _energy(z)  # (sensor, slope)
+    energy = energy_by_slope(z)  # (sensor, slope)
     own = sets @ energy
     middle = energy.shape[-1] // 2
     # Without a channel both parts have their best slopes, and no slip has the best slope of all.
@@ -329,7 +330,7 @@ def _skewed(z: Tensor, sets: Tensor, log_chance: Tensor, *, fixed: bool) -> _Fit
     inside = sets[which].bool()
     slope, size = best_slope(z[inside])
     rest, rest_size = (0.0, math.inf) if fixed else best_slope(z[~inside])
-    variance = _variance(size) + _variance(rest_size)
+    variance = slope_variance(size) + slope_variance(rest_size)
     ratio = float(torch.logsumexp(means + log_chance, 0))
     return _Fit(which, slope - rest, variance, [], (0, 0), float(gains[which]), ratio, rest)
 
@@ -339,11 +340,11 @@ def _lost(z: Tensor, sets: Tensor, log_chance: Tensor, angle: float, *, fixed: b
     rests, handicap = [0.0] * len(sets), torch.zeros(len(sets), dtype=torch.float64)
     if not fixed:
         rests = [best_slope(z[~row.bool()])[0] for row in sets]
-    straight = z * _turn(-torch.tensor(rests, dtype=torch.float64))[:, None]  # (set, sensor, block)
+    straight = z * turn_by(-torch.tensor(rests, dtype=torch.float64))[:, None]  # (set, sensor, block)
     if not fixed:
         # No slip may have another slope than is best for the others alone.
         straight_energy = straight.sum(-1).abs().square().sum(-1) / BLOCKS
-        handicap = (_energy(z).sum(0).amax() - straight_energy).clamp(min=0.0)
+        handicap = (energy_by_slope(z).sum(0).amax() - straight_energy).clamp(min=0.0)
     paths = paths_of(straight, sets, angle)
     ratios = paths.log_ratio - handicap + log_chance
     which = int(ratios.argmax())
@@ -353,25 +354,3 @@ def _lost(z: Tensor, sets: Tensor, log_chance: Tensor, angle: float, *, fixed: b
     lost = min(low, count), max(high, count)
     gain -= float(handicap[which])
     return _Fit(which, 0.0, 0.0, losses, lost, gain, float(torch.logsumexp(ratios, 0)), rests[which], angle)
-
-
-def _slopes() -> Tensor:
-    """Slopes of the phase that are searched, cycles over the record, `(slope,)`, 0 in the middle."""
-    return torch.arange(-_CYCLES * _FINER, _CYCLES * _FINER + 1, dtype=torch.float64) / _FINER
-
-
-def _turn(cycles: float | Tensor) -> Tensor:
-    """`exp(2 pi i cycles s)` at the middles `s` of the blocks, from 0 to 1."""
-    s = (torch.arange(BLOCKS, dtype=torch.float64) + 0.5) / BLOCKS
-    phase = 2 * math.pi * torch.as_tensor(cycles, dtype=torch.float64)[..., None] * s
-    return torch.polar(torch.ones_like(phase), phase)
-
-
-def _energy(z: Tensor) -> Tensor:
-    """Energy of a tone with each slope of the phase, nats, `(row, slope)`."""
-    return (z @ _turn(-_slopes()).mT).abs().square() / BLOCKS
-
-
-def _variance(energy: float) -> float:
-    """Variance of the slope of a phase, cycles over the record, for a tone of so many nats (Cramer-Rao bound)."""
-    return 6 / (4 * math.pi**2 * max(energy, 1.0))

@@ -70,18 +70,17 @@ def p_value_beside(own: RingScan, simulated: RingScan) -> float:
     return max(beyond_all, p_value_beyond_largest(largest, strongest, times_as_many))
 
 
-def apart(cells: list[RingCell]) -> Iterator[RingCell]:
-    """Those that no likelier one comes near to, in time and frequency."""
-    kept: list[RingCell] = []
-    for cell in cells:
-        if not any(_near(cell, other) for other in kept):
-            kept.append(cell)
-            yield cell
-
-
-def _near(cell: RingCell, other: RingCell) -> bool:
-    apart, resolved = abs(cell.frequency - other.frequency), 2 / min(cell.tau, other.tau)
-    return abs(cell.onset - other.onset) < max(cell.length, other.length) and apart < resolved
+def apart(cells: Sequence[RingCell]) -> Iterator[RingCell]:
+    """Of cells, the likeliest first, those that no likelier one comes near to, in time and frequency."""
+    rows = [(cell.onset, cell.length, cell.frequency, cell.tau) for cell in cells]
+    onset, length, frequency, tau = torch.tensor(rows, dtype=torch.float64).view(-1, 4).T
+    left = torch.arange(len(cells))
+    while len(left):
+        first, left = left[0], left[1:]
+        yield cells[int(first)]
+        together = (onset[left] - onset[first]).abs() < torch.maximum(length[left], length[first])
+        resolved = 2 / torch.minimum(tau[left], tau[first])
+        left = left[~(together & ((frequency[left] - frequency[first]).abs() < resolved))]
 
 
 def irreversible(found: RingScan, backwards: RingScan, n_samples: int) -> RingScan:

@@ -89,8 +89,8 @@ def fitted_track(found: Candidates, combinations: Tensor, length: int, cut: floa
             powers = torch.einsum("cp,cps->cs", signs, parts).abs().square() / signs.abs().sum(-1, keepdim=True)
             held = _held(parts, cut)
             parts, blocks = parts * held, blocks * held[..., None]
-        family_wise_p_value = (combinations.to(parts.dtype) @ parts).abs().square().sum(-1) / combinations.abs().sum(-1)
-        power, which = family_wise_p_value.max(-1)
+        of_each = (combinations.to(parts.dtype) @ parts).abs().square().sum(-1) / combinations.abs().sum(-1)
+        power, which = of_each.max(-1)
         signs = combinations[which].to(blocks.dtype)
         tried = 4.0 * (count / joined) ** 2  # independent tracks for each bin at both ends
         tails.append(_log_tail(joined, power) + math.log(tried))

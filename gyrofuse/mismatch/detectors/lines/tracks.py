@@ -83,9 +83,8 @@ def _conspicuous(segments: Tensor, moves: int, signs: Tensor) -> Candidates:
         torch.fft.fft(turned, out=bins)
         powers = squared_modulus(bins).clamp_(max=_CUT).sum(0)
         each = torch.arange(max(undone - _EVERY // 2, 1) * _FINER, min(undone + _EVERY // 2, moves) * _FINER)
-        power, which, along = _most_power(bins, powers, each, signs, most)
-        better = power > least
-        found.append(_candidates(power[better], signs[which[better]], along[better], bins, undone))
+        power, which, along = _most_power(bins, powers, each, signs, most, least)
+        found.append(_candidates(power, signs[which], along, bins, undone))
         found = [Candidates(*map(torch.cat, zip(*found, strict=True))).strongest(most)]
         least = float(found[0].power.min()) if len(found[0].power) == most else 0.0
     return found[0]
@@ -100,7 +99,9 @@ def _signs(p: int) -> Tensor:
     return every[first > 0]
 
 
-def _most_power(bins: Tensor, powers: Tensor, moves: Tensor, signs: Tensor, most: int) -> tuple[Tensor, Tensor, Tensor]:
+def _most_power(
+    bins: Tensor, powers: Tensor, moves: Tensor, signs: Tensor, most: int, least: float
+) -> tuple[Tensor, Tensor, Tensor]:
     """Tracks on which all sensors have most power: that of their likeliest combination, which, and their bins.
 
     Args:
@@ -109,6 +110,7 @@ def _most_power(bins: Tensor, powers: Tensor, moves: Tensor, signs: Tensor, most
         moves: Bins from segment to segment, at least, `(move,)`.
         signs: The combinations, `(combination, sensor)`.
         most: Tracks of each move.
+        least: Power that a track has to be above.
 
     Returns:
         `(track,)`, `(track,)` and `(track, segment)`.
@@ -118,9 +120,13 @@ def _most_power(bins: Tensor, powers: Tensor, moves: Tensor, signs: Tensor, most
     values = bins[:, torch.arange(count), along % length]  # (sensor, track, segment)
     values = values * (math.sqrt(_CUT) / values.abs().clamp(min=math.sqrt(_CUT)))
     parts = torch.view_as_real(values).movedim(0, 1).flatten(2)  # real and imaginary, of each track
-    products = (parts @ parts.mT).flatten(1)  # of two sensors
-    power = products @ (signs[:, :, None] * signs[:, None]).flatten(1).mT / signs.abs().sum(-1)
-    return (*power.max(-1), along)
+    products = parts @ parts.mT  # of two sensors
+    # No combination has more power than the largest eigenvalue, whose square is no more than the norm of the square.
+    possible = (products @ products).flatten(1).norm(dim=-1) > least**2
+    power = products[possible].flatten(1) @ (signs[:, :, None] * signs[:, None]).flatten(1).mT / signs.abs().sum(-1)
+    power, which = power.max(-1)
+    above = power > least
+    return power[above], which[above], along[possible][above]
 
 
 def _candidates(power: Tensor, signs: Tensor, along: Tensor, bins: Tensor, undone: int) -> Candidates:

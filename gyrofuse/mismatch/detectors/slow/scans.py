@@ -346,7 +346,7 @@ def _between(family: Family, likely: Tensor, number: int = 96) -> Family:
     per_number = round(number ** (1 / len(spans)))
     grids = [torch.linspace(low, high, per_number, dtype=torch.float64) for low, high in spans]
     points = torch.cartesian_prod(*grids).view(-1, len(spans))
-    if len(spans) == 2:  # closer time constants are one, with sizes that cancel each other
+    if len(spans) == 2 and not family.timed:  # closer time constants are one, with sizes that cancel each other
         points = points[points[:, 1] > 1.5 * points[:, 0]]
     return family.at(points)
 

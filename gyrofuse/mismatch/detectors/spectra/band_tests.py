@@ -9,15 +9,34 @@ import torch
 from scipy import stats
 from torch import Tensor
 
+from gyrofuse.mismatch.detectors.lines.line_signs import line_signs
 from gyrofuse.mismatch.detectors.lines.line_sizes import LineSizes, line_sizes
 from gyrofuse.mismatch.detectors.result import TestResult
+from gyrofuse.mismatch.detectors.slow.slow_power import slow_power
 from gyrofuse.mismatch.detectors.variance.level_spread import level_variance
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.stats.multiplicity import sidak
 
 
 def spectrum_test(comparison: Comparison) -> TestResult:
-    """Ratio of powers in each band and sensor, F distributed with both records' degrees of freedom.
+    """Ratio of powers in each band and sensor, or of all that is slow together."""
+    found, slow = _of_bands(comparison), slow_power(comparison)
+    if slow is None:
+        return found
+    f, sensor = slow.frequency * comparison.info.rate, comparison.info.sensors[slow.sensor]
+    together = TestResult(
+        "spectrum",
+        slow.p_value,
+        f"power below {f:.3g} Hz is {slow.ratio:.3g} times the simulation's in sensor {sensor}",
+        sensors=(slow.sensor,),
+        levels=(level_of(slow.frequency),),
+        frequency_hz=f,
+    )
+    return min((replace(e, p_value=sidak(e.p_value, 2)) for e in (found, together)), key=lambda e: e.p_value)
+
+
+def _of_bands(comparison: Comparison) -> TestResult:
+    """Of each band, F distributed with both records' degrees of freedom.
 
     Those of a fitted model are fewer by what its numbers may be off.
     """
@@ -56,8 +75,18 @@ def line_test(comparison: Comparison) -> TestResult:
     sizes = line_sizes(comparison)
     if sizes is None:
         return found
-    both = (found, _other_size(comparison, sizes))
-    return min((replace(e, p_value=sidak(e.p_value, len(both))) for e in both), key=lambda e: e.p_value)
+    every = (found, _other_size(comparison, sizes), *_other_sign(comparison))
+    return min((replace(e, p_value=sidak(e.p_value, len(every))) for e in every), key=lambda e: e.p_value)
+
+
+def _other_sign(comparison: Comparison) -> tuple[TestResult, ...]:
+    """Sensors in which all lines of the simulation have the opposite phase, if any."""
+    signs = line_signs(comparison)
+    if signs is None or bool((signs.sign > 0).all()):
+        return ()
+    turned = tuple((signs.sign < 0).nonzero()[:, 0].tolist())
+    words = f"the simulation's lines have the opposite phase in {comparison.info.named(turned)}"
+    return (TestResult("line", signs.p_value, words, sensors=turned, levels=(1,)),)
 
 
 def _other_size(comparison: Comparison, sizes: LineSizes) -> TestResult:

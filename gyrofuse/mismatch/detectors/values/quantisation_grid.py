@@ -52,6 +52,11 @@ class Lattice(NamedTuple):
     p_value: float
     peak: float = 0.0
 
+    @classmethod
+    def none(cls) -> Lattice:
+        """That of values without a grid."""
+        return cls(0.0, 0.0, 0.0, 1.0)
+
 
 class HiddenStep(NamedTuple):
     """The hidden step that one or several sensors are likeliest to have.
@@ -241,15 +246,17 @@ def off_lattice(values: Tensor, step: float | Tensor, offset: float | Tensor) ->
 
 
 class Missing(NamedTuple):
-    """Grids that the simulation does not have and could be rounded to.
+    """Grids of the recording that are not the simulation's.
 
     Attributes:
         p_value: p value of no such grid.
         lattices: Grids by position of the sensor.
+        coarser: Exact grids of the simulation that are coarser than the recording's, or have none beside them.
     """
 
     p_value: float
     lattices: dict[int, Lattice]
+    coarser: dict[int, Lattice]
 
 
 def missing_lattices(comparison: Comparison, level: float) -> Missing:
@@ -259,13 +266,18 @@ def missing_lattices(comparison: Comparison, level: float) -> Missing:
         comparison: Recording and simulation.
         level: p value above which a hidden step is none.
     """
-    observed, reference = exact_lattices(comparison.observed), exact_lattices(comparison.reference)
+    observed, reference = exact_lattices(comparison.as_came), exact_lattices(comparison.reference)
+    coarser = {
+        i: other
+        for i, other in enumerate(reference)
+        if other is not None and _too_coarse(comparison, i, observed[i], other)
+    }
     missing = {
         i: own
         for i, (own, other) in enumerate(zip(observed, reference, strict=True))
-        if own is not None and not (other is not None and other.step > own.step * (1 - 1e-3))
+        if own is not None and (i in coarser or other is None or other.step <= own.step * (1 - 1e-3))
     }
-    p_value = 0.0 if missing else 1.0
+    p_value = 0.0 if missing or coarser else 1.0
     hidden = [i for i, own in enumerate(observed) if own is None]
     while hidden:
         p, here = _hidden_in(comparison, hidden, level)
@@ -274,10 +286,28 @@ def missing_lattices(comparison: Comparison, level: float) -> Missing:
             break
         missing |= here
         hidden = [i for i in hidden if i not in here]
-    return Missing(p_value, dict(sorted(missing.items())))
+    return Missing(p_value, dict(sorted(missing.items())), coarser)
 
 
-def _hidden_in(comparison: Comparison, sensors: list[int], level: float) -> Missing:
+def _too_coarse(comparison: Comparison, sensor: int, own: Lattice | None, other: Lattice) -> bool:
+    """Whether a grid of the simulation is one that the recording's values are not on, nor on one like it that hides."""
+    # Step over the sd of a sample given its past: a finer one adds less than 1/190 of its variance. Share of samples on
+    # a grid, above which values have it but for what filled gaps: half of those with half its step are on it.
+    coarse, on = 0.25, 0.75
+    if other.step < coarse * float(innovation_sd(comparison.reference)[sensor]):
+        return False
+    values = comparison.as_came.signal[0, sensor]
+    turn = torch.exp(2j * math.pi / other.step * values).mean().angle()
+    off = off_lattice(values, other.step, float(turn) / (2 * math.pi) * other.step)
+    if float((off.abs() < 0.01).to(torch.float64).mean()) > on:
+        return False
+    if own is not None:
+        return own.step < other.step * (1 - 1e-3)
+    unique = distinct_values(comparison.as_came)[sensor][0]
+    return _lattice_at(unique, 2 * math.pi / other.step, other.step).p_value > CERTAIN
+
+
+def _hidden_in(comparison: Comparison, sensors: list[int], level: float) -> tuple[float, dict[int, Lattice]]:
     """The likeliest hidden step of some sensors, and the grids of those that have it; none above the level.
 
     That the simulation shows it in some of them as well is no mismatch unless one of the recording's is clearer.
@@ -285,14 +315,14 @@ def _hidden_in(comparison: Comparison, sensors: list[int], level: float) -> Miss
     values = [distinct_values(comparison.observed)[i][0] for i in sensors]  # each counts once, whatever repeats
     found = _hidden_step(values, core_sd(comparison.observed)[sensors])
     if found.p_value > level:
-        return Missing(found.p_value, {})
+        return found.p_value, {}
     grids = {i: _lattice_at(v, found.peak, found.step) for i, v in zip(sensors, values, strict=True)}
     beside = {i: _beside_simulation(comparison, i, own) for i, own in grids.items()}
     p_value = found.p_value
     if any(beside[i] > own.p_value for i, own in grids.items()):
         p_value = max(p_value, sidak(min(beside.values()), len(sensors)))
     have = {i: own._replace(p_value=beside[i]) for i, own in grids.items() if beside[i] < _OF_OTHERS}
-    return Missing(p_value, _as_large(have) if p_value <= level else {})
+    return p_value, _as_large(have) if p_value <= level else {}
 
 
 def _as_large(missing: dict[int, Lattice]) -> dict[int, Lattice]:

@@ -158,7 +158,8 @@ def band_of(found: Recurring, values: Tensor, sd: float) -> Band | None:
         values: Samples, `(time,)`.
         sd: Standard deviation of the simulation's values.
     """
-    if _leaves_gap(found):
+    # What is put out in a wide band has nearly all of the values, and their scatter is not that of what it took.
+    if _leaves_gap(found, found.spread) or (sd > 0 and _leaves_gap(found, sd)):
         return Band(*_limits(found), float(values.mean()), False)
     return _subtracted(found, values, sd)
 
@@ -201,13 +202,13 @@ def _limits(found: Recurring) -> tuple[float, float, float]:
     return middle, low, high
 
 
-def _leaves_gap(found: Recurring) -> bool:
+def _leaves_gap(found: Recurring, sd: float) -> bool:
     """Whether as many samples are missing around the value as returned to it: it is not one that was filled in.
 
     The number missing follows from the density beside the band, as a normal law has it within; other laws are within a
     factor of 1.5. The nearest value that is left lies beyond the band by one on average.
     """
-    law, reach = stats.norm(found.middle, found.spread), found.reach
+    law, reach = stats.norm(found.middle, sd), found.reach
     ends = found.value - reach, found.value + reach
     beside = float(law.pdf(ends[0]) + law.pdf(ends[1])) / 2
     wide = float(law.cdf(ends[1]) - law.cdf(ends[0])) / beside if beside > 0 else 2 * reach

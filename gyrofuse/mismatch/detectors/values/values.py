@@ -25,9 +25,11 @@ END_STOPS = 1  # position of a converter's end stops in the chain from sensor to
 
 
 class Repeats(NamedTuple):
-    """How often a sample equals the one before, and what is expected, each `(sensor,)`.
+    """How often a sample equals the one before, and what is expected, `(sensor,)` but for the first.
 
     Attributes:
+        same: Which samples of the recording repeat the one before, `(sensor, time)`; none where values end, which is
+            what makes them the same.
         share: Share of repeats in the recording.
         expected: Share expected from the simulation and the recording's own resolution.
         sd: Standard deviation of the difference by chance.
@@ -35,6 +37,7 @@ class Repeats(NamedTuple):
         n: Number of samples.
     """
 
+    same: Tensor
     share: Tensor
     expected: Tensor
     sd: Tensor
@@ -49,6 +52,7 @@ def repeated(signal: Tensor) -> Tensor:
     return same
 
 
+@derived
 def repeats(comparison: Comparison) -> Repeats:
     """Repeats of the recording against those of the simulation.
 
@@ -57,6 +61,9 @@ def repeats(comparison: Comparison) -> Repeats:
     and those that the resolution makes (Poisson).
     """
     same, other_same = (repeated(side.signal).movedim(1, 0) for side in (comparison.observed, comparison.reference))
+    for end in end_stops(comparison):
+        if end.p_value < CERTAIN:
+            same[end.sensor] &= comparison.recording[end.sensor] != end.limit
     n, m = same[0].numel(), other_same[0].numel()
     share, other = (side.to(torch.float64).mean((1, 2)) for side in (same, other_same))
     # A resolution finer than any grid that matters, such as that of float32, makes a few.
@@ -78,9 +85,12 @@ def repeats(comparison: Comparison) -> Repeats:
     compared = stats.binom.sf((events - 1).numpy(), (events + other_events).numpy(), portion)
     by_resolution_alone = stats.poisson.sf((events - 1).numpy(), few.numpy())
     # A sensor that hangs is no matter of how often values meet.
-    hangs = (repeats_so_far(same).amax((1, 2)) >= 8) & (other_events == 0)
-    counted = np.where(hangs.numpy(), by_resolution_alone, np.maximum(compared, by_resolution_alone))
-    return Repeats(share, expected, sd, torch.from_numpy(np.where(few.numpy() < 20.0, counted, many)), n)
+    longest = repeats_so_far(same).amax((1, 2))
+    hangs = (longest >= 8) & (other_events == 0)
+    row = n * by_resolution.clamp(min=1 / n).pow(longest)  # expected number of rows as long, each value by chance
+    hanging = np.minimum(by_resolution_alone, row.numpy())
+    counted = np.where(hangs.numpy(), hanging, np.maximum(compared, by_resolution_alone))
+    return Repeats(same[:, 0], share, expected, sd, torch.from_numpy(np.where(few.numpy() < 20.0, counted, many)), n)
 
 
 def _events(same: Tensor) -> Tensor:
@@ -121,13 +131,14 @@ class EndStop(NamedTuple):
     p_value: float
 
 
+@derived
 def end_stops(comparison: Comparison) -> tuple[EndStop, ...]:
     """The ends of every sensor's values, with p values of values that are not cut.
 
     Given all other samples, `x_t` is normal with mean `m_t` and sd `s`: were nothing cut, the expected number of
     samples beyond the largest one, `sum_t Q((max - m_t)/s)`, would be standard exponential or less. Continuous values
     do not meet their maximum twice either: the two largest are 10 cells of the resolution in the noise's sd apart, with
-    margin.
+    margin. A stretch that was recorded twice does, after the same sample.
     """
     expected = left_out(comparison.observed)
     found = []
@@ -139,8 +150,13 @@ def end_stops(comparison: Comparison) -> tuple[EndStop, ...]:
         for sign in (1, -1):
             limit = float((sign * x).max())
             at = sign * x == limit
-            runs = int((at[1:] & ~at[:-1]).sum()) + int(at[0])
-            if runs < 2 or _simulation_ends(comparison, i, sign):
+            begins = (at[1:] & ~at[:-1]).nonzero()[:, 0]  # samples before the limit is reached
+            runs = int(at[0]) + (len(begins) if rounded else len(x[begins].unique()))
+            if (
+                runs < 2
+                or _filled_in(comparison, i, at, max(3 * resolution, sd))
+                or _simulation_ends(comparison, i, sign)
+            ):
                 found.append(EndStop(i, sign, sign * limit, 1.0))
                 continue
             beyond = float(torch.special.ndtr((sign * mean - limit - resolution / 2) / sd).sum())
@@ -151,6 +167,26 @@ def end_stops(comparison: Comparison) -> tuple[EndStop, ...]:
                 p = max(p, float(special.pdtrc(runs - 1, 4.0)))
             found.append(EndStop(i, sign, sign * limit, sidak(p, 4 * comparison.n_sensors)))
     return tuple(found)
+
+
+def _filled_in(comparison: Comparison, sensor: int, at: Tensor, far: float) -> bool:
+    """Whether the largest or smallest value stands in the place of samples that are not there.
+
+    Next to an end stop there are values; and where it holds for long, others do not hang.
+
+    Args:
+        comparison: Recording and simulation.
+        sensor: Position of the sensor.
+        at: Samples that have the value, `(time,)`.
+        far: Distance to the next value that no end stop leaves.
+    """
+    x = comparison.recording
+    same, ends = repeated(x), (x == x.amax(-1, keepdim=True)) | (x == x.amin(-1, keepdim=True))
+    held = same[sensor] & at
+    others = (same & ~ends).any(0)
+    elsewhere = x[sensor, ~at]
+    gap = float((elsewhere - x[sensor, at][0]).abs().min()) if len(elsewhere) else 0.0
+    return gap > far or (int(held.sum()) > 8 and int((held & others).sum()) > 0.9 * int(held.sum()))
 
 
 def _regressed(x: Tensor, mean: Tensor, step: float) -> tuple[Tensor, float]:
@@ -201,6 +237,10 @@ def values_test(comparison: Comparison) -> TestResult:
     if rounded.lattices:
         at, found = min(rounded.lattices.items(), key=lambda item: item[1].p_value)
         candidates.append((rounded.p_value, at, f"values on a lattice of {found.step:.4g} {comparison.info.measure}"))
+    elif rounded.coarser:
+        at, found = next(iter(rounded.coarser.items()))
+        words = f"values off the lattice of {found.step:.4g} {comparison.info.measure} to which the simulation rounds,"
+        candidates.append((rounded.p_value, at, words))
     often = int(same.argmin())
     candidates.append(
         (sidak(float(same[often]), comparison.n_sensors), often, "samples repeated more often than there")

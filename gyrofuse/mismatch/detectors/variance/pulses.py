@@ -64,13 +64,14 @@ def pulse_p_value(comparison: Comparison) -> float:
 def scanned_pulses(white: Tensor) -> RingScan:
     """All pulses of whitened samples `(sensor, time)`."""
     clip, fewest = 4.5, 64  # standard deviations: no single sample is a pulse; widths that a record has room for
-    white = (white / local_level(white).sqrt()).clamp(-clip, clip)
+    local = local_level(white)
+    white = (white / local.sqrt()).clamp(-clip, clip)
     total, n_cells, found = -math.inf, 0, list[RingCell]()
     scale, widths = 1, [2, 3, 4, 6]
     while 6 * fewest <= white.shape[-1]:
         for width in widths:
             ends = 2 * width  # where a filter lets in what is not there
-            score = _over_median(_seen(white, width), width)[:, ends:-ends].square() / 2  # (sensor, place)
+            score = _over_median(_seen(white, width), local, width)[:, ends:-ends].square() / 2  # (sensor, place)
             n_cells += score.shape[-1]
             places = (score.amax(0) > NATS_AS_GOOD).nonzero()[:, 0]
             if not len(places):
@@ -79,7 +80,8 @@ def scanned_pulses(white: Tensor) -> RingScan:
             total = float(torch.logaddexp(log_ratios.logsumexp(0), torch.tensor(total, dtype=torch.float64)))
             found += _likeliest(log_ratios, score[:, places], places + ends, scale, width)
         n = white.shape[-1] // 2 * 2
-        white, scale, widths = white[:, :n].unflatten(-1, (-1, 2)).sum(-1) / math.sqrt(2), 2 * scale, [4, 6]
+        white, local = white[:, :n].unflatten(-1, (-1, 2)).sum(-1) / math.sqrt(2), local[:, :n:2]
+        scale, widths = 2 * scale, [4, 6]
     found.sort(key=lambda cell: -cell.log_ratio)
     return RingScan(total - math.log(max(n_cells, 1)), n_cells, tuple(apart(found)))
 
@@ -90,11 +92,15 @@ def _seen(white: Tensor, width: int) -> Tensor:
     return torch.nn.functional.conv1d(white[:, None], (half_wave / half_wave.norm())[None, None])[:, 0]
 
 
-def _over_median(z: Tensor, width: int) -> Tensor:
-    """Over the median modulus of normal values: of all, and of those nearby where that is larger."""
+def _over_median(z: Tensor, local: Tensor, width: int) -> Tensor:
+    """Over the median modulus of normal values: of all, and of those in quiet times and nearby where that is larger.
+
+    Where a fast tone is loud, what is slow has become quieter than it is with the local level.
+    """
     normal, near = 0.6745, 48 * width  # samples
-    size = z.abs()
-    level = size.median(-1, keepdim=True).values.clamp(min=1e-12)
+    size, local = z.abs(), local[:, : z.shape[-1]]
+    quiet = size.masked_fill(local > local.median(-1, keepdim=True).values, math.nan).nanmedian(-1, keepdim=True).values
+    level = torch.maximum(size.median(-1, keepdim=True).values, quiet).clamp(min=1e-12)
     n = z.shape[-1] // near
     if n > 1:
         parts = size[:, : n * near].unflatten(-1, (n, near)).median(-1).values

@@ -47,7 +47,7 @@ def best_terms(data: Ratios, *, differ: bool) -> Choice:
         now = list(best.terms) if best else []
         likeliest = _likeliest(data, now)
         if differ and all(term.acts == "add" for term in now):
-            likeliest += _levels_through_filters(data, now)
+            likeliest += _levels_beside(data, now)
         tried = [_varied(data, _pruned(data, f)) for f in likeliest]
         tried = [f for f in tried if evidence(data, f) > value]
         earned = [f for f in tried if best is None or _earned(data, best, f, f.terms[-1])]
@@ -109,8 +109,8 @@ def _likeliest(data: Ratios, company: list[Term]) -> list[Fit]:
     return [_given_over(data, fit(data, f.terms)) for f in kept]
 
 
-def _levels_through_filters(data: Ratios, company: list[Term]) -> list[Fit]:
-    """Other levels and a filter at once beside what is added, the likeliest: one by one, an AR1 would stand for both.
+def _levels_beside(data: Ratios, company: list[Term]) -> list[Fit]:
+    """Other levels and a filter, or noise on top at high frequencies, at once: one by one, an AR1 would stand for both.
 
     What a filter passes shows the level: below some frequency, one of a few that its corner may be above.
     """
@@ -119,7 +119,7 @@ def _levels_through_filters(data: Ratios, company: list[Term]) -> list[Fit]:
         passed = (frequency > below / 4) & (frequency < below)
         for start in levels(data, passed) if bool(passed.any()) else ():
             terms = [*company, start]
-            starts += [[*terms, filtered] for filtered in candidates(data, terms, "filter")]
+            starts += [[*terms, filtered] for filtered in candidates(data, terms, beside_levels=True)]
     starts.sort(key=lambda terms: -float(power_gains(data, pieces(data, terms).power(data)).sum()))
     tried = [fit(data, terms, _QUICK) for terms in starts[:n_fitted]]
     likeliest = sorted((f for f in tried if math.isfinite(f.gain)), key=lambda f: -evidence(data, f))[:2]

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.decisions import NATS_PER_NUMBER
-from gyrofuse.mismatch.likelihoods.spectra.filter_forms import FILTERS, filter_power, strength_of
+from gyrofuse.mismatch.likelihoods.spectra.filter_forms import FILTERS, filter_power, filter_response, strength_of
 from gyrofuse.mismatch.likelihoods.spectra.noise_parts import Ground, Parts
 from gyrofuse.mismatch.stats.limits import Z
 
@@ -31,6 +31,7 @@ class Term:
     name: ClassVar[str]  # of the mechanism
     acts: ClassVar[str] = "add"  # or "scale" the noise, "filter" everything
     coherent: ClassVar[bool] = False  # whether sensors share it
+    turns: ClassVar[bool] = False  # whether it moves phases
     lower: ClassVar[float] = -math.inf  # bounds of local numbers
     upper: ClassVar[float] = math.inf
     prior_scale: ClassVar[float | None] = None  # of local numbers around zero, heavy tails: `spectral.prior_cost`
@@ -46,6 +47,10 @@ class Term:
 
     def values(self, ground: Ground, local: Tensor, shared: Tensor) -> Tensor:
         """Factors on spectra, or densities added, `(..., sensor, node)`, of numbers with leading dimensions."""
+        raise NotImplementedError
+
+    def turn(self, f: Tensor) -> Tensor:
+        """What it turns each sensor by at `f` cycles per sample, complex of size one, `(sensor, frequency)`."""
         raise NotImplementedError
 
     def prior(self) -> Tensor | None:
@@ -222,6 +227,7 @@ class LowPass(Term):
 
     name: ClassVar[str] = "low_pass"
     acts: ClassVar[str] = "filter"
+    turns: ClassVar[bool] = True
     lower: ClassVar[float] = -8.0  # corner at the rate over 10^4
     upper: ClassVar[float] = math.log(1000)  # a tangent that is reached at 0.4997 of the rate: no band shows it
 
@@ -242,6 +248,10 @@ class LowPass(Term):
     def values(self, ground: Ground, local: Tensor, shared: Tensor) -> Tensor:
         power = filter_power(self.kind, strength_of(self.kind, local[..., 0, :]), ground.nodes)
         return torch.where(self.free[0, :, None], power, 1.0)
+
+    def turn(self, f: Tensor) -> Tensor:
+        response = filter_response(self.kind, strength_of(self.kind, self.local[0]), f)
+        return torch.where(self.free[0, :, None], response.sgn(), 1.0)
 
     def form_cost(self, n_sensors: int) -> float:
         return super().form_cost(n_sensors) + math.log(len(FILTERS))

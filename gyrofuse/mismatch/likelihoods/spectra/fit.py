@@ -79,7 +79,8 @@ def fit(data: Ratios, terms: Sequence[Term], rounds: int = 40) -> Fit:
     enough = 0.01  # nats that a further round has to gain
     terms = tuple(term.within() for term in terms)
     coherent, added = (any(x) for x in ((t.coherent for t in terms), (t.acts == "add" for t in terms)))
-    paired = bool((data.pair_dof > 0).any()) and (coherent or (added and not data.independent))
+    turns = any(t.turns for t in terms)
+    paired = bool((data.pair_dof > 0).any()) and (coherent or ((added or turns) and not data.independent))
     whole = paired or coherent  # else powers are all that is asked for
 
     def model_of(parts: Pieces) -> Tensor:
@@ -201,15 +202,18 @@ class Pieces(NamedTuple):
         factor: Factors on the noise, `(..., sensor, node)`.
         added: Densities added.
         filters: Factors on everything.
-        common: Cross-spectra of common sources over the reference's powers, `(band, sensor, sensor)`.
+        common: Cross-spectra of common sources over the reference's powers, `(band, sensor, sensor)`; None without.
         values: What each term does, in the order of the terms; of a common source its cross-spectra.
+        turn: What filters turn everything by, complex of size one, `(band, sensor)`; None without such a filter. Steps
+            of a fit hold it, as powers tell most of what they are.
     """
 
     factor: Tensor
     added: Tensor
     filters: Tensor
-    common: Tensor
+    common: Tensor | None = None
     values: tuple[Tensor, ...] = ()
+    turn: Tensor | None = None
 
     def with_term(self, acts: str, values: Tensor, instead: Tensor | float | None = None) -> Pieces:
         """With one more term that acts in some way; or with other `values` of one that is there, `instead`."""
@@ -225,34 +229,42 @@ class Pieces(NamedTuple):
         ground, mean_of = data.ground, data.ground.bands.mean_of
         size = (mean_of(self.factor * self.filters * ground.density) / ground.mean).clamp(min=0).sqrt().mT
         extra = (mean_of(self.added * self.filters) / ground.mean).mT
-        own = data.expected * (size[..., :, None] * size[..., None, :]) + torch.diag_embed(extra)
-        return own + self.common * self.passed(ground)
+        own = data.expected * (size[..., :, None] * size[..., None, :]) * self._turned() + torch.diag_embed(extra)
+        return own if self.common is None else own + self.common * self.passed(ground)
 
     def passed(self, ground: Ground) -> Tensor:
         """Factors of filters on cross-spectra, `(..., band, sensor, sensor)`."""
         gain = ground.bands.mean_of(self.filters).clamp(min=0).sqrt().mT
-        return gain[..., :, None] * gain[..., None, :]
+        return gain[..., :, None] * gain[..., None, :] * self._turned()
+
+    def _turned(self) -> Tensor | float:
+        """Factors of size one on cross-spectra, `(band, sensor, sensor)`."""
+        return 1.0 if self.turn is None else self.turn[:, :, None] * self.turn[:, None, :].conj()
 
     def power(self, data: Ratios) -> Tensor:
         """Powers over the reference's, `(..., band, sensor)`."""
         ground, mean_of = data.ground, data.ground.bands.mean_of
         own = mean_of((self.factor * ground.density + self.added) * self.filters) / ground.mean
-        return own.mT + powers(self.common) * mean_of(self.filters).mT
+        return own.mT if self.common is None else own.mT + powers(self.common) * mean_of(self.filters).mT
 
 
 def pieces(data: Ratios, terms: Sequence[Term]) -> Pieces:
     """What terms do to the reference's noise."""
     ground = data.ground
     one = torch.ones_like(ground.density)
-    found, values = Pieces(one, torch.zeros_like(one), one, torch.zeros_like(data.expected)), list[Tensor]()
+    found, values = Pieces(one, torch.zeros_like(one), one), list[Tensor]()
     for term in terms:
         if isinstance(term, Common):
             made = _relative(ground, term.shape(ground, term.shared)) * term.matrix()
-            found = found._replace(common=found.common + made)
+            found = found._replace(common=made if found.common is None else found.common + made)
         else:
             made = term.values(ground, term.local, term.shared)
             found = found.with_term(term.acts, made)
         values.append(made)
+    if any(term.turns for term in terms):
+        f = ground.bands.frequency
+        turns = [term.turn(f).mT for term in terms if term.turns]
+        found = found._replace(turn=torch.stack(turns).prod(0))
     return found._replace(values=tuple(values))
 
 

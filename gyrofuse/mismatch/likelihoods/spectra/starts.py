@@ -25,9 +25,11 @@ class SpectralTerms:
 
     Attributes:
         made_of: What its terms do: they "scale" the noise, "add" to it, or "filter" everything.
+        leaves_levels: Whether they leave the level of the noise to be seen at low frequencies, as filters do.
     """
 
     made_of: ClassVar[str] = "add"
+    leaves_levels: ClassVar[bool] = False
 
     @classmethod
     def starts(cls, data: Ratios, company: Sequence[Term]) -> Iterable[Term]:
@@ -51,15 +53,15 @@ class SpectralTerms:
 
 
 def levels(data: Ratios, passed: Tensor) -> Iterator[Term]:
-    """Levels that a recording's noise may have before a filter which passes some bands `(band,)`."""
+    """Levels that a recording's noise may have beside what leaves some bands `(band,)` as they are."""
     for kind in declared(SpectralTerms):
         yield from kind.levels(data, passed)
 
 
-def candidates(data: Ratios, company: Sequence[Term], made_of: str | None = None) -> Iterator[Term]:
-    """Terms of all mechanisms that declare any, to add to some; only of those that do one thing, where given."""
+def candidates(data: Ratios, company: Sequence[Term], *, beside_levels: bool = False) -> Iterator[Term]:
+    """Terms of all mechanisms that declare any, to add to some; or of those beside which levels are seen."""
     for kind in declared(SpectralTerms):
-        if made_of in (None, kind.made_of):
+        if not beside_levels or kind.leaves_levels or kind.made_of == "filter":
             yield from kind.starts(data, company)
 
 
@@ -82,6 +84,22 @@ def best_start(data: Ratios, beside: Pieces, family: Term) -> tuple[Term, float]
     best, local = gains.argmax(0), family.local.expand(-1, -1, data.n_sensors)
     local = local.gather(0, best[None, None].expand(1, *local.shape[1:]))[0]
     return replace(family, local=local), float(gains.amax(0).clamp(min=0).sum())
+
+
+def best_of_families(data: Ratios, beside: Pieces, families: Term) -> Term:
+    """Of families of starts the one that is likeliest in all sensors together, each at its likeliest start.
+
+    Args:
+        data: What is to be explained.
+        beside: What other terms do.
+        families: Starts `local` `(start, number, 1)`, and `shared` numbers of each family, `(family, 1, number)`.
+    """
+    values = families.values(data.ground, families.local, families.shared)  # (family, start, sensor or 1, node)
+    gains = power_gains(data, beside.with_term(families.acts, values).power(data)).sum(-2)  # (family, start, sensor)
+    most, best = gains.max(1)
+    chosen = int(most.clamp(min=0).sum(-1).argmax())
+    local = families.local[best[chosen], :, 0].mT  # (number, sensor)
+    return replace(families, local=local, shared=families.shared[chosen, 0])
 
 
 def closest_starts(data: Ratios, beside: Pieces, families: Sequence[Term]) -> list[Term]:

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from scipy import optimize
 from torch import Tensor
 
-from gyrofuse.mismatch.likelihoods.outlier_law import Outliers, Sample, bounds_of, law_of
+from gyrofuse.mismatch.likelihoods.outlier_law import Array, Outliers, Sample, bounds_of
 from gyrofuse.mismatch.stats.limits import Z
 
 _STEP, _LONGER = 0.15, 1.5  # of the way outwards: first, logarithm, and each next over the one before
@@ -31,14 +31,15 @@ def _limits(sample: Sample, best: list[float], k: int) -> tuple[float, float]:
     """Where the likelihood of number `k`, all others at their best, is as far below its maximum as 95 % allow."""
     bounds = bounds_of(sample.n)
     others = [j for j in range(len(best)) if j != k]
-    most = sample.deviance(law_of(best)) + Z**2 / 2
+    most = sample.deviance(best)[0] + Z**2 / 2
 
     def excess_from(rest: list[float]) -> Callable[[float], float]:
         def excess(value: float) -> float:
-            def deviance(theta: list[float]) -> float:
-                return sample.deviance(law_of([*theta[:k], value, *theta[k:]]))
+            def deviance(theta: Array) -> tuple[float, Array]:
+                total, slopes = sample.deviance([*theta[:k], value, *theta[k:]])
+                return total, slopes[others]
 
-            run = optimize.minimize(deviance, rest, method="L-BFGS-B", bounds=[bounds[j] for j in others])
+            run = optimize.minimize(deviance, rest, method="L-BFGS-B", jac=True, bounds=[bounds[j] for j in others])
             rest[:] = run.x
             return float(run.fun) - most
 

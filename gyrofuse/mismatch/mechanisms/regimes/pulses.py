@@ -59,9 +59,12 @@ class Pulses(Transient):
         p_value = pulse_p_value(comparison)
         if p_value > level:
             return None
-        pulses = sorted(_pulses(comparison), key=lambda one: -float(one.log_ratio.sum()))
+        pulses = _those_alone(comparison, _pulses(comparison))
+        pulses.sort(key=lambda one: -float(one.log_ratio.sum()))
         if not pulses or _to_and_fro(pulses) or _of_any_length(pulses):
             return None
+        if sum(float(one.log_ratio.sum()) for one in pulses) < -math.log(max(p_value, 1e-300)):
+            return None  # what is so conspicuous is something else
         info, rate = comparison.info, comparison.info.rate
         effect, strongest = cls.of(pulses, comparison), pulses[0]
         around = _around(comparison, comparison.recording, strongest.pulse)
@@ -89,7 +92,7 @@ class Pulses(Transient):
             parameters,
             levels=(level_of(min(0.5 / strongest.pulse.width, 0.5)),),
             time_s=onset,
-            gain=float(sum(one.log_ratio.sum() for one in pulses)),
+            gain=effect.gained(comparison, 3 * len(pulses) + int(effect.size.count_nonzero())),
         )
 
     @classmethod
@@ -142,6 +145,7 @@ def _pulses(comparison: Comparison) -> list[FittedPulse]:
     """Those that stand out, the strongest of each scan first, each fitted to what the others leave."""
     scan, found, left = pulses_of(comparison), list[FittedPulse](), comparison.recording
     rounds, most, most_doubtful, n = 4, 200, 6, comparison.n_samples
+    shared = torch.corrcoef(comparison.lineless.clamp(-4, 4)).view(comparison.n_sensors, -1)
     for _ in range(rounds):
         doubtful, new, by_chance = list[FittedPulse](), list[FittedPulse](), math.log(scan.n_cells)
         for cell in scan.cells:
@@ -150,7 +154,8 @@ def _pulses(comparison: Comparison) -> list[FittedPulse]:
             around = Surroundings.of(left, comparison.base, cell.onset, float(cell.length))
             one = fitted_pulse(around, cell.onset, cell.length, range(comparison.n_sensors))
             one = sized(around, one.pulse, included_sensors(2 * one.log_ratio, 1).positions)
-            if float(one.log_ratio.sum()) < by_chance + NATS_AS_GOOD:
+            numbers = int(one.amplitude.count_nonzero())  # each of which gains half a nat by chance
+            if min(float(one.log_ratio.sum()), _jointly(one, shared)) < by_chance + NATS_AS_GOOD + numbers / 2:
                 continue
             (new if _is_one(around, one) else doubtful).append(one)
             left = left - _path(one.pulse, one.amplitude, n)
@@ -167,10 +172,41 @@ def _pulses(comparison: Comparison) -> list[FittedPulse]:
     return found
 
 
+def _jointly(one: FittedPulse, shared: Tensor) -> float:
+    """Log likelihood ratio of a pulse where sensors share noise, of correlations `(sensor, sensor)`."""
+    has = one.amplitude != 0
+    z = torch.sqrt(2 * one.log_ratio[has]) * one.amplitude[has].sign()
+    among = shared[has][:, has] + 1e-6 * torch.eye(len(z), dtype=z.dtype)
+    return float(z @ torch.linalg.solve(among, z)) / 2
+
+
 def _is_one(around: Surroundings, one: FittedPulse) -> bool:
     """Whether no other course explains as much."""
     there = sized(around, one.pulse, one.amplitude.nonzero()[:, 0].tolist())
     return float(there.log_ratio.sum()) > other_course(around, there) + NATS_PER_NUMBER
+
+
+def _those_alone(comparison: Comparison, found: Sequence[FittedPulse]) -> list[FittedPulse]:
+    """Those that begin and end, and are no end of what is loud before or after, nor left of what was taken off."""
+    sides, loud, larger, normal = 8, 4.0, 10.0, 0.6745  # widths; sds of the record; times the pulse; of a modulus
+    n, paths = comparison.n_samples, [_path(one.pulse, one.amplitude, comparison.n_samples) for one in found]
+    all_of_them = torch.stack(paths).sum(0) if paths else torch.zeros_like(comparison.recording)
+    quiet = whitened(comparison.recording - all_of_them, comparison.base).abs()
+    level = quiet.median(-1).values / normal
+    taken = whitened(comparison.taken_off + all_of_them, comparison.base)
+    alone = []
+    for one, path in zip(found, paths, strict=True):
+        if one.pulse.onset < -0.5 or one.pulse.onset + one.pulse.width > n:  # a record's end shows no pulse
+            continue
+        has, width = one.amplitude != 0, max(math.ceil(one.pulse.width), 4)
+        first, end = max(round(one.pulse.onset) - width, 0), min(round(one.pulse.onset) + 2 * width, n)
+        besides = (quiet[has, max(first - sides * width, 0) : first], quiet[has, end : end + sides * width])
+        noisy = [(b.square().mean(-1).sqrt() > loud * level[has]).any() for b in besides if b.shape[-1] >= width]
+        seen = whitened(path, comparison.base)
+        own, others = (x[has, first:end].square().sum() for x in (seen, taken - seen))
+        if not any(noisy) and float(others) < larger**2 * float(own):
+            alone.append(one)
+    return alone
 
 
 def _to_and_fro(pulses: Sequence[FittedPulse]) -> bool:

@@ -119,7 +119,7 @@ class RingDown(Transient):
             levels=(level_of(strongest.tone.frequency),),
             frequency_hz=f,
             time_s=onset,
-            gain=float(sum(tone.log_ratio.sum() for tone in tones)),
+            gain=effect.gained(comparison, 3 * len(tones) + 2 * int((effect.amplitude > 0).sum())),
         )
 
     @classmethod
@@ -190,7 +190,8 @@ def _tones(comparison: Comparison) -> list[FittedTone]:
     """All tones that ring down, the strongest of each scan first."""
     left, scan, tones = comparison.recording, ring_downs(comparison), list[FittedTone]()
     # Scans, tones that are told apart, and cells of a scan that are no ring-down: what lasts has many of them.
-    rounds, most, most_refused = 4, 48, 4
+    rounds, most, most_refused, most_waves, waves = 4, 48, 4, 4, 0
+    mostly, rings = 0.8, 0.3  # of the energy; cycles in a time constant
     line = moving_line(comparison.observed)
     for _ in range(rounds):
         new, by_chance, refused = list[FittedTone](), math.log(scan.n_cells), 0
@@ -198,13 +199,21 @@ def _tones(comparison: Comparison) -> list[FittedTone]:
         for cell in scan.cells:
             if cell.log_ratio < by_chance or len(tones) + len(new) >= most or refused >= most_refused:
                 break
-            if line.passes(cell.onset, cell.frequency):  # which wanders, and beats with the noise
+            passes = line.passes(cell.onset, cell.frequency)  # a line that wanders, and beats with the noise
+            if passes and waves >= most_waves:
                 continue
             around = Surroundings.of(left, comparison.base, cell.onset, cell.tau)
             found = around.fitted(DampedTone(cell.onset, cell.frequency, cell.tau))
             which = list(included_sensors(2 * found.log_ratio, 2).positions)
             found = _only(around.fitted(found.tone, which), which)
             if float(found.log_ratio.sum()) < least or _faint(found, tones + new):
+                continue
+            if found.tone.frequency * found.tone.tau < rings:  # a step, a drift, a bias that swings
+                refused += 1
+                continue
+            # Of a line there is more before and after; knocks one after the other look like one that comes and goes.
+            if passes and float(around.explained(found)[which].max()) < mostly:
+                waves += 1
                 continue
             rung = _ring_down(around, found, which)
             left = left - sum(_path(one, comparison.n_samples) for one in rung)
@@ -219,13 +228,21 @@ def _tones(comparison: Comparison) -> list[FittedTone]:
 
 
 def _ring_down(around: Surroundings, found: FittedTone, sensors: Sequence[int]) -> list[FittedTone]:
-    """The tone, or two that set in together where one seems to grow at first; none where another course is likelier."""
-    rival, gain, near = around.other_courses(found, sensors), float(found.log_ratio.sum()), 0.8
-    if gain > rival + NATS_PER_NUMBER:
+    """The tone, or two where one seems to grow at first; none where another course is likelier.
+
+    Two that set in together and beat, or one mode that is struck once more before it has died away.
+    """
+    rival, gain, near = around.other_courses(found, sensors), float(found.log_ratio.sum()), 0.4
+    nearly_all = 0.95  # of the energy there: what another course says more of is a matter of form
+    if gain > rival + NATS_PER_NUMBER or around.explained(found)[list(sensors)].min() > nearly_all:
         return [found]
-    if gain < near * rival:  # two modes that beat look like one, more or less
+    if gain < near * rival:  # two that beat, or one after the other, look like one, more or less
         return []
-    both = around.two_modes(found, sensors)
+    both = max(
+        around.two_modes(found, sensors),
+        around.two_knocks(found, sensors),
+        key=lambda two: float(two[0].log_ratio[list(sensors)].sum()),
+    )
     gain = float(both[0].log_ratio[list(sensors)].sum())
     more = 2 + 2 * len(sensors)  # numbers
     return [_only(one, sensors) for one in both] if gain > rival + NATS_PER_NUMBER * (1 + more) else []

@@ -81,12 +81,14 @@ class _Law(NamedTuple):
 def _lasts(z: Tensor) -> bool:
     """Whether the level of values `(time,)` lasts over neighbouring samples, as in episodes: then it is none of these.
 
-    By the correlations of the log moduli, which outliers hardly move, at distances of 1 to 9 samples.
+    By the correlations of the log moduli, which outliers hardly move, at distances of 1 to 9 samples: of one of them,
+    or of all together, as where jumps or knocks take some samples each.
     """
     log_size = z.abs().clamp(min=1e-3 * float(z.abs().median())).log()
     log_size = log_size - log_size.mean()
     lags = [float((log_size[k:] * log_size[:-k]).mean() / log_size.square().mean()) for k in range(1, 10)]
-    return max(lags) > max(0.1, 4 / math.sqrt(len(z)))  # a tenth: less than a seventh of the samples would last
+    n, one, all_of_them = len(z), 0.1, 0.02  # a tenth: less than a seventh of the samples would last
+    return max(lags) > max(one, 4 / math.sqrt(n)) or sum(lags) / 9 > max(all_of_them, 4 / math.sqrt(9 * n))
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,12 +165,15 @@ class ScaleMixture(Mechanism):
         return replace(self, share=torch.where(has, share, 0.0), ratio=torch.where(has, ratio, 1.0))
 
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
-        rows = []
-        for row, share, ratio in zip(
-            left_out(comparison.observed).white[0], self.share.tolist(), self.ratio.tolist(), strict=True
-        ):
+        gaussian, rows = gaussian_sensors(comparison.reference), []
+        simulated = left_out(comparison.reference).white.movedim(0, 1).flatten(1)
+        for i, row in enumerate(left_out(comparison.observed).white[0]):
+            share, ratio = float(self.share[i]), float(self.ratio[i])
             small = float(row.square().mean().sqrt()) / math.sqrt(1 - share + share * ratio**2)
-            rows.append(_Law(share, small, ratio * small).gains(row) if share else torch.zeros_like(row))
+            gains = _Law(share, small, ratio * small).gains(row) if share else torch.zeros_like(row)
+            if share and not bool(gaussian[i]):  # what else was found may make such values as well
+                gains = gains - _Law.fitted(simulated[i]).gains(row)
+            rows.append(gains)
         return held_out_blocks(torch.stack(rows), fold).sum((0, -1))
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:

@@ -134,7 +134,8 @@ class RandomTelegraph(Mechanism):
     def apply_to_reference(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
         built = super().apply_to_reference(comparison, generator)
         scatter = partial(self._scatter, comparison.base, comparison.info.rate)
-        return replace(built, bent=(*built.bent, scatter))
+        # Where a model is Gaussian, jumps that were built into it are not.
+        return replace(built, bent=(*built.bent, scatter), reference=replace(built.reference, gaussian=False))
 
     def _scatter(self, base: NoiseSpectrum, rate: float, f: Tensor) -> Tensor:
         """Factors `(sensor, frequency)` by which powers of two records differ, at `f` cycles per sample.

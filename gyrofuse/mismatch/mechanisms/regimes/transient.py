@@ -8,6 +8,7 @@ import torch
 from scipy import stats
 from torch import Tensor
 
+from gyrofuse.mismatch.decisions import NATS_PER_NUMBER
 from gyrofuse.mismatch.likelihoods.noise_near import noise_along
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism, Parameter
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
@@ -45,6 +46,11 @@ class Transient(Mechanism):
         of_blocks = gains[:, : N_JUDGED * block].unflatten(-1, (N_JUDGED, block)).sum(-1)
         scores = (of_blocks / noise_along(taken, white - taken).clamp(min=1e-300)).sum(0)
         return scores.view(N_JUDGED // N_FOLDS, N_FOLDS).sum(-1)
+
+    def gained(self, comparison: Comparison, numbers: int) -> float:
+        """Log likelihood ratio in sample less what so many numbers cost, nats: which course it is, it says as well."""
+        taken = whitened(self.path(comparison.n_samples, comparison.info.rate), comparison.base)
+        return float((comparison.white * taken - taken.square() / 2).sum()) - NATS_PER_NUMBER * numbers
 
     def remove(self, signal: Tensor, info: RecordingInfo) -> Tensor:
         return signal - self.path(signal.shape[-1], info.rate)

@@ -20,10 +20,11 @@ from gyrofuse.mismatch.detectors.variance.noise_level import (
 )
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
 from gyrofuse.mismatch.mechanisms.regimes.changing_variance import ChangingVariance
-from gyrofuse.mismatch.signals.comparison import Comparison
+from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples, held_out_blocks
+from gyrofuse.mismatch.signals.lines import whitened
 from gyrofuse.mismatch.signals.variance_course import VarianceCourse, corner_of, fast_factor, whitened_factor
 from gyrofuse.mismatch.stats.level_scan import Reference, scanned_levels
 from gyrofuse.mismatch.stats.limits import Z
@@ -70,7 +71,7 @@ class VarianceChange(ChangingVariance):
         if p_value > level:
             return None
         white, found = whitened_recording(comparison), likeliest_episodes(comparison)
-        if found is None or goes_up_and_down(comparison, found):
+        if found is None or goes_up_and_down(comparison, found) or _left_over(comparison, found):
             return None
         held = _held(comparison, found) or _held(comparison, stretch_of(white))
         if held is None:
@@ -127,8 +128,8 @@ class VarianceChange(ChangingVariance):
         scores = own_spread(comparison).weight[:, None] * scores
         return held_out_blocks(scores, fold).sum((0, -1))
 
-    def course(self, n_samples: int, rate: float) -> VarianceCourse:
-        return VarianceCourse(self._inside(n_samples, rate), self.factor, self.corner_hz / rate)
+    def course(self, n_samples: int, info: RecordingInfo) -> VarianceCourse:
+        return VarianceCourse(self._inside(n_samples, info.rate), self.factor, self.corner_hz / info.rate)
 
     def _inside(self, n_samples: int, rate: float) -> Tensor:
         within = torch.zeros(n_samples, dtype=torch.bool)
@@ -153,6 +154,18 @@ def _held(comparison: Comparison, found: Episodes) -> tuple[Episodes, Reference 
     )
     known = float((posterior.log_factor.abs() / posterior.log_factor_sd).max()) > _KNOWN
     return (found, reference, posterior) if known else None
+
+
+def _left_over(comparison: Comparison, found: Episodes) -> bool:
+    """Whether it is left of something so much louder that was taken off, whose form was not quite the one assumed."""
+    if comparison.observed is comparison.as_came:
+        return False
+    much = 30.0  # times the energy of what is there
+    taken = whitened(comparison.taken_off, comparison.base)
+    inside, has = found.inside(comparison.n_samples), found.factor > 1
+    return bool(has.any()) and float(taken[has][:, inside].square().sum()) > much * float(
+        comparison.white[has][:, inside].square().sum()
+    )
 
 
 @derived

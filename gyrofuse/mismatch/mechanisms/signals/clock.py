@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.detectors.lines.clocks import BLOCKS, SIMULATION, best_slope, demodulated, strongest_slip
+from gyrofuse.mismatch.detectors.lines.clocks import SIMULATION, strongest_slip
+from gyrofuse.mismatch.detectors.lines.demodulation import BLOCKS, best_slope, demodulated
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
@@ -74,14 +75,17 @@ class ClockSkew(Mechanism):
         who = info.named(slip.sensors, "all sensors")
         against = f"the tone at {slip.frequency * rate:.6g} Hz in "
         against += "the other sensors" if slip.reference is None else slip.reference
+        if losses and slip.reference == SIMULATION:
+            against = f"a tone at {slip.frequency * rate:.6g} Hz that keeps its phase"
         if losses:
             lost = sum(count for _, count in losses)
+            counted = f"{lost} sample{'s' if lost > 1 else ''}"
             parameters = {"lost": Parameter(lost, *slip.lost, "")}
             for j, ((at, _), (first, last)) in enumerate(zip(losses, limits, strict=True)):
                 parameters[f"time_of_loss_{j + 1}"] = Parameter(at / rate, first / rate, last / rate, "s")
             times = ", ".join(f"{at / rate:.4g}" for at, _ in losses)
             sentence = (
-                f"{who} lost {lost} samples against {against}: its phase steps at {times} s; whole periods of "
+                f"{who} lost {counted} against {against}: its phase steps at {times} s; whole periods of "
                 f"the tone, {1 / slip.frequency:.4g} samples each, would leave no step"
             )
         else:
@@ -109,7 +113,7 @@ class ClockSkew(Mechanism):
             frequency_hz=slip.frequency * rate,
             time_s=losses[0][0] / rate if losses else None,
             channel=None if slip.reference == SIMULATION else slip.reference,
-            alternatives=("vibration_tone",) if slip.reference == SIMULATION else (),
+            alternatives=("vibration_tone",) if slip.reference == SIMULATION and not losses else (),
             gain=slip.gain,
         )
 

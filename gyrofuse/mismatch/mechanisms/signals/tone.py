@@ -163,6 +163,7 @@ class VibrationTone(Mechanism):
             tone = torch.stack([angle.cos(), angle.sin()])
             basis = torch.cat([tone, clock * tone])
             gram, seen = basis @ basis.mT, basis @ signal.mT
+            gram = gram + 1e-12 * gram.trace() * torch.eye(4, dtype=gram.dtype)  # next to half the rate sines vanish
             at = torch.linalg.solve(gram[:2, :2], seen[:2])  # (2, sensor)
             slope = torch.stack([at[1], -at[0]])  # of the phase, on the clock
             slope = torch.cat([-torch.linalg.solve(gram[:2, :2], gram[:2, 2:] @ slope), slope])  # (4, sensor)

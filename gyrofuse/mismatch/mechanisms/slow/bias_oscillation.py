@@ -23,7 +23,7 @@ from gyrofuse.mismatch.stats.limits import Z
 
 @dataclass(frozen=True, eq=False)
 class BiasOscillation(SlowEffect):
-    """`x_i(t) = size_i cos(2 pi t / P) + sine_i sin(2 pi t / P)` in every sensor `i`, two to eleven times in a record.
+    """`x_i(t) = size_i cos(2 pi t / P) + sine_i sin(2 pi t / P)` in every sensor `i`, 1.25 to eleven times in a record.
 
     Slower than a vibration tone, which is found beside its neighbours in the spectrum: here slow noise is as strong as
     the simulation says, or stronger.
@@ -41,8 +41,8 @@ class BiasOscillation(SlowEffect):
 
     @classmethod
     def families(cls, comparison: Comparison) -> Iterable[Family]:
-        fewest, most, a_cycle = 2, 11, 4  # cycles in the record, and templates from one to the next
-        cycles = torch.linspace(fewest, most, (most - fewest) * a_cycle + 1, dtype=torch.float64)
+        fewest, most, a_cycle = 1.25, 11, 4  # cycles in the record, and templates from one to the next
+        cycles = torch.linspace(fewest, most, round((most - fewest) * a_cycle) + 1, dtype=torch.float64)
         ends = comparison.block * torch.arange(N_BLOCKS + 1, dtype=torch.float64)
 
         def design_at(points: Tensor) -> Tensor:

@@ -64,10 +64,15 @@ class SlowEffect(Mechanism, SlowTemplates):
         raise NotImplementedError
 
     @classmethod
+    def owns(cls, scan: Scan) -> bool:
+        """Whether the best of a scan under its name is of this form, where several forms share the name."""
+        return True
+
+    @classmethod
     def fit_in_place_of(cls, finding: Finding, comparison: Comparison) -> Rival | None:
         """Another path of the same sensors in the same noise."""
         scan, effect = slow_analysis(comparison).scan(cls.name), finding.effect
-        if scan is None or not isinstance(effect, SlowEffect):
+        if scan is None or not cls.owns(scan) or not isinstance(effect, SlowEffect):
             return None
         rival = cls.of(scan, comparison.info.rate, finding.sensors)
         return Rival(replace(rival, log_factors=effect.log_factors), scan.gain)
@@ -202,7 +207,9 @@ def strong_scan(comparison: Comparison, name: str, level: float) -> Strong | Non
     elif any(gain > scan.gain + NATS_AS_GOOD for gain in rivals.values()):
         return None
     else:
-        strong = strong._replace(alternatives=tuple(r for r, gain in rivals.items() if gain > scan.gain - NATS_AS_GOOD))
+        longer = {other.family.name for other in analysis.scans if other.family.becomes == name}
+        equals = [r for r, gain in rivals.items() if gain > scan.gain - NATS_AS_GOOD and r not in longer]
+        strong = strong._replace(alternatives=tuple(equals))
     return strong if strong.scan.p_value <= min(level, _STRONG) else None
 
 
@@ -245,14 +252,14 @@ def slow_finding(
         for i in which:
             value, reach = float(effect.sizes[i, path]), Z * float(found.sd[i, path])
             limits[f"{name}[{i}]"] = Parameter(value, value - reach, value + reach, unit)
-    up_to = effect.amplitude
+    up_to, article = effect.amplitude, "an" if of[0] in "aeiou" else "a"
     largest = max(which, key=lambda i: float(up_to[i]))
     # A block is no more than half a wavelet there.
     levels = range(int(math.log2(comparison.n_samples / N_BLOCKS)) + 1, int(math.log2(comparison.n_samples)) + 1)
     return Finding(
         effect.name,
         effect,
-        f"the bias of {info.named(which)} {words}, with a {of} of up to "
+        f"the bias of {info.named(which)} {words}, with {article} {of} of up to "
         f"{float(up_to[largest]):.3g} {sizes[0][1]} (sensor {info.sensors[largest]})",
         scan.p_value,
         which,

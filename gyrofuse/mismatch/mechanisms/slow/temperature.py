@@ -12,7 +12,7 @@ from torch import Tensor
 from gyrofuse.mismatch.detectors.slow.estimates import estimate, log_factors, only
 from gyrofuse.mismatch.detectors.slow.scans import Scan
 from gyrofuse.mismatch.detectors.slow.surrogates import beats_surrogates
-from gyrofuse.mismatch.likelihoods.slow_templates import Family, lagged, temperatures
+from gyrofuse.mismatch.likelihoods.slow_templates import Family, ThermalForm, lagged, temperatures
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding
 from gyrofuse.mismatch.mechanisms.slow.slow_effect import SlowEffect, in_seconds, slow_finding, strong_scan
@@ -25,19 +25,22 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class TemperatureDrift(SlowEffect):
-    """`x_i(t) = size_i u(t) + curvature_i u(t)^2`, `u = theta(t) - theta(0)`, in every sensor `i`.
+    """`x_i(t) = size_i u(t) + curvature_i u(t)^2 + cubic_i u(t)^3`, `u = theta(t) - theta(0)`, in every sensor `i`.
 
     `theta` is what a part has whose heat follows the temperature `T` of a channel with the lag `tau`:
-    `tau d theta / dt = T - theta`. A smooth channel fits a random walk by chance: beside the likelihood, surrogates of
-    the channel with random phases must do worse.
+    `tau d theta / dt = T - theta`. Where the way counts by which a temperature was reached, and not in all sensors
+    alike, `u = T(t) - T(0)` instead, and `change_i d theta / dt` is added. A smooth channel fits a random walk by
+    chance: beside the likelihood, surrogates of the channel with random phases must do worse.
 
     Attributes:
         size: Coefficients, `(sensor,)`, unit of the signal per unit of temperature.
         lag_s: `tau`, s; 0 for none.
         channel: Name of the channel.
         row: Its row.
-        curvature: Of the square, `(sensor,)`, unit of the signal per unit of temperature squared; none where the line
-            is straight.
+        curvature: Of the square and of the cube, `(sensor,)` each, unit of the signal per unit of temperature to that
+            power; none where the line is straight.
+        change: Of the rate of change, `(sensor,)`, unit of the signal per unit of temperature and second; none where
+            that adds nothing.
     """
 
     name: ClassVar[str] = "temperature_drift"
@@ -47,6 +50,7 @@ class TemperatureDrift(SlowEffect):
     channel: str
     row: int
     curvature: tuple[OfSensors, ...] = ()
+    change: tuple[OfSensors, ...] = ()
 
     @classmethod
     def families(cls, comparison: Comparison) -> Iterable[Family]:
@@ -61,12 +65,18 @@ class TemperatureDrift(SlowEffect):
         if not beats_surrogates(analysis, scan, comparison.generator()):
             return None
         found = estimate(analysis, scan)
+        found = found._replace(sd=found.sd * _per_second(scan, comparison.info.rate))
         effect, lag = cls.of(scan, comparison.info.rate), in_seconds(found.points[0], comparison.info.rate)
-        if not effect.curvature:
+        if effect.form == ThermalForm(1, changes=False):
             effect = replace(effect, size=only(found.size[:, 0], scan.sensors), lag_s=lag.value)
         lag = lag._replace(value=effect.lag_s)
-        words = f"follows {effect.channel}" + (f" with a lag of {lag.value:.3g} s" if lag.low > 0 else "")
+        words = f"follows {effect.channel}"
+        if effect.change:
+            words += " and its rate of change"
+        elif lag.low > 0:
+            words += f" with a lag of {lag.value:.3g} s"
         unit = comparison.info.measure
+        powers = [("coefficient", f"{unit}/K"), ("curvature", f"{unit}/K^2"), ("cubic", f"{unit}/K^3")]
         return slow_finding(
             comparison,
             strong,
@@ -74,16 +84,25 @@ class TemperatureDrift(SlowEffect):
             found,
             words + (", in a line that is bent" if effect.curvature else ""),
             {"lag": lag},
-            sizes=[("coefficient", f"{unit}/K"), ("curvature", f"{unit}/K^2")],
+            sizes=[*powers[: effect.form.powers], ("change", f"{unit} per K/s")],
             channel=effect.channel,
         )
 
     @classmethod
     def of(cls, scan: Scan, rate: float, which: Sequence[int] | None = None) -> TemperatureDrift:
         """The best of a scan, in its sensors or in others."""
-        size, *further = only(scan.fit.size, scan.sensors if which is None else which).unbind(-1)
         family = scan.family
-        return cls(size, log_factors(scan), scan.point[0] / rate, family.channel or "", family.row, tuple(further))
+        assert family.form is not None
+        sizes = only(scan.fit.size, scan.sensors if which is None else which) * _per_second(scan, rate)
+        powers, change = sizes.unbind(-1)[: family.form.powers], sizes.unbind(-1)[family.form.powers :]
+        return cls(
+            powers[0], log_factors(scan), scan.point[0] / rate, family.channel or "", family.row, powers[1:], change
+        )
+
+    @property
+    def form(self) -> ThermalForm:
+        """What it has of the temperature."""
+        return ThermalForm(1 + len(self.curvature), bool(self.change))
 
     @property
     def follows(self) -> tuple[str, ...]:
@@ -91,21 +110,30 @@ class TemperatureDrift(SlowEffect):
 
     @property
     def sizes(self) -> Tensor:
-        return torch.stack([self.size, *self.curvature], -1)
+        return torch.stack([self.size, *self.curvature, *self.change], -1)
 
     def with_sizes(self, sizes: Tensor) -> TemperatureDrift:
         size, *further = sizes.unbind(-1)
-        return replace(self, size=size, curvature=tuple(further))
+        n = len(self.curvature)
+        return replace(self, size=size, curvature=tuple(further[:n]), change=tuple(further[n:]))
 
     def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
-        channel = lagged(
-            comparison.info, self.channel, self.row, self.lag_s * comparison.info.rate, comparison.n_samples
-        )
+        at_once = 0.0 if self.change else self.lag_s * comparison.info.rate
+        channel = lagged(comparison.info, self.channel, self.row, at_once, comparison.n_samples)
         path = self._effect(comparison.n_samples, comparison.info) if fitted else None
-        label = f"{self.channel}, with the lag" if self.lag_s else self.channel
+        label = f"{self.channel}, with the lag" if at_once else self.channel
         pictures.means_against(ax, comparison, sensor, channel, label, path)
 
     def paths(self, n_samples: int, info: RecordingInfo) -> Tensor:
-        path = lagged(info, self.channel, self.row, self.lag_s * info.rate, n_samples)
-        path = path - path[0]
-        return torch.stack([path, *(path.square() for _ in self.curvature)])
+        temperature, lagging = (
+            lagged(info, self.channel, self.row, lag, n_samples) for lag in (0.0, self.lag_s * info.rate)
+        )
+        return self.form.paths(temperature, lagging, self.lag_s)
+
+
+def _per_second(scan: Scan, rate: float) -> Tensor:
+    """Factors `(path,)` that make sizes of paths counted by samples those of paths counted by seconds."""
+    factors = torch.ones(scan.fit.size.shape[-1], dtype=torch.float64)
+    if scan.family.form is not None and scan.family.form.changes:
+        factors[-1] /= rate
+    return factors

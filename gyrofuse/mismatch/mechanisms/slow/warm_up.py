@@ -51,13 +51,17 @@ class WarmUpTransient(SlowEffect):
     slower: tuple[Decay, ...] = ()
 
     @classmethod
+    def owns(cls, scan: Scan) -> bool:
+        return not scan.family.timed
+
+    @classmethod
     def families(cls, comparison: Comparison) -> Iterable[Family]:
         return (warm_ups(comparison, decays) for decays in (1, 2))
 
     @classmethod
     def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
         strong = strong_scan(comparison, cls.name, level)
-        if strong is None:
+        if strong is None or not cls.owns(strong.scan):
             return None
         analysis, scan = strong.analysis, strong.scan
         found, rate = estimate(analysis, scan), comparison.info.rate

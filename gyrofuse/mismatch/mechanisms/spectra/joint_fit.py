@@ -94,6 +94,8 @@ def chosen_shape(comparison: Comparison, name: str, level: float) -> Shape | Non
         return None
     peak = oscillation_of(comparison)
     plain = peak is not None and peak.stretch.p_value <= level and peak.nats > 3 * NEW_TERM_NATS
+    if best.fits and peak is not None and peak.width > _SHARP * peak.centre:  # bands would show it
+        plain = False
     if peak is not None and plain and name != "resonance" and _stands_out(comparison, best, peak):
         return None
     if swept(comparison, best.gain, level):

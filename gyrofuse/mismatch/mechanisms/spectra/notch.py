@@ -14,7 +14,7 @@ from gyrofuse.mismatch.likelihoods.spectra.components import Term
 from gyrofuse.mismatch.likelihoods.spectra.fit import pieces
 from gyrofuse.mismatch.likelihoods.spectra.noise_parts import Ground
 from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios
-from gyrofuse.mismatch.likelihoods.spectra.starts import best_start
+from gyrofuse.mismatch.likelihoods.spectra.starts import best_of_families
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Rival
 from gyrofuse.mismatch.mechanisms.spectra.findings import found, spanned
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import chosen_shape, refit
@@ -53,9 +53,9 @@ class Notch(Term):
     def within(self) -> Notch:
         """Both sides of it are below half the rate: else it is a low pass."""
         narrowest, widest = math.log(0.02), torch.tensor(0.0, dtype=torch.float64)
-        centre = self.shared[0].clamp(max=math.log(0.46))
+        centre = self.shared[..., 0].clamp(max=math.log(0.46))
         upper = torch.minimum((0.5 / centre.exp() - 1).log(), widest)
-        shared = torch.stack([centre, self.shared[1].clamp(min=narrowest).minimum(upper)])
+        shared = torch.stack([centre, self.shared[..., 1].clamp(min=narrowest).minimum(upper)], -1)
         return replace(self, local=self.local.clamp(min=self.lower, max=self.upper), shared=shared)
 
 
@@ -161,11 +161,7 @@ def _start(data: Ratios, company: Sequence[Term]) -> Term:
     centres = torch.linspace(math.log(lowest), math.log(0.46), 32, dtype=torch.float64)
     widths = torch.tensor([0.1, 0.3, 0.9], dtype=torch.float64).log()
     depths = torch.tensor([0.0, 0.1, 0.3, 0.7, 1.5, 3.0], dtype=torch.float64)
-    local, beside = depths[:, None, None], pieces(data, company)
     every = torch.ones(1, data.n_sensors, dtype=torch.bool)
-    starts = (
-        best_start(data, beside, Notch(local, every, shared).within())
-        for shared in torch.cartesian_prod(centres, widths)
-    )
-    best, _ = max(starts, key=lambda start: start[1])
+    family = Notch(depths[:, None, None], every, torch.cartesian_prod(centres, widths)[:, None]).within()
+    best = best_of_families(data, pieces(data, company), family)
     return replace(best, local=best.local.clamp(min=float(depths[1])))

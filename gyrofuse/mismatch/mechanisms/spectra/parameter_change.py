@@ -125,6 +125,9 @@ class ParameterShift(Filter):
         lacks = Parts(self.base, torch.tensor([1 / self.base.n_samples], dtype=torch.float64)).lacks
         return not bool((lacks & (self.log_factors[[0, 1, 3]] != 0)).any())
 
+    def beneath(self, later: Sequence[Mechanism], before: Comparison) -> Mechanism:
+        return self.beneath_noise(later, before)
+
     @classmethod
     def from_term(cls, term: Term, comparison: Comparison) -> ParameterShift | None:
         return cls(reference_noise(comparison), term.local) if isinstance(term, Shift) else None

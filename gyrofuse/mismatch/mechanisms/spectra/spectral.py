@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -87,9 +88,50 @@ class Filter(Spectral):
     def factor(self, base: NoiseSpectrum, f: Tensor) -> Tensor:
         return self.response(f).abs().square()
 
+    def beneath_noise(self, later: Sequence[Mechanism], before: Comparison) -> Mechanism:
+        """What acts on the simulation's own noise alone, as it is judged beside noise on top."""
+        on_top = tuple(effect for effect in later if isinstance(effect, Addition))
+        return Beneath(self, on_top, before) if on_top else self
+
     def spectra(self, matrices: Tensor, f: Tensor) -> Tensor:
         gain = self.response(f).mT.to(matrices.dtype)  # (frequency, sensor)
         return matrices * (gain[:, :, None] * gain[:, None, :].conj() + FLOOR * torch.eye(gain.shape[-1]))
+
+
+@dataclass(frozen=True, eq=False)
+class Beneath(Mechanism):
+    """A filter of the simulation's own noise, where noise on top is there already, which it does not act on.
+
+    Attributes:
+        inner: The filter.
+        on_top: The noise.
+        before: Recording and simulation without it.
+    """
+
+    changes_noise: ClassVar[bool] = True
+    inner: Filter
+    on_top: tuple[Addition, ...]
+    before: Comparison
+
+    def fit_without(self, comparison: Comparison, fold: int) -> Mechanism:
+        inner = self.inner.fit_without(self.before, fold)
+        return replace(self, inner=inner) if isinstance(inner, Filter) else inner
+
+    def spectra(self, matrices: Tensor, f: Tensor) -> Tensor:
+        least = 1e-3  # share of its powers that the simulation's own noise has at least
+        on_top = torch.stack([effect.density(f) for effect in self.on_top]).sum(0).diagonal(dim1=-2, dim2=-1).real
+        whole = matrices.diagonal(dim1=-2, dim2=-1).real
+        added = torch.diag_embed(on_top.minimum((1 - least) * whole)).to(matrices.dtype)
+        return self.inner.spectra(matrices - added, f) + added
+
+    def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
+        return super().held_out_scores(comparison, fold) + slow_gains(comparison, self.spectra, fold)
+
+    def repair(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
+        made = self.inner.repair(self.before, generator)
+        for effect in self.on_top:
+            made = effect.repair(made, generator)
+        return made
 
 
 class Addition(Spectral):

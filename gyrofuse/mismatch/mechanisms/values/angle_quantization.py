@@ -55,6 +55,7 @@ class AngleQuantization(Addition):
     name: ClassVar[str] = "quantization_noise"
     rivals: ClassVar[tuple[str, ...]] = ("parameter_shift", "low_pass", "flicker", "common_mode")
     separated_by: ClassVar[str] = "a recording at a higher rate"
+    leaves_levels: ClassVar[bool] = True
     variance: OfSensors
 
     @classmethod

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, ClassVar
@@ -46,7 +46,7 @@ class Quantization(Mechanism):
     """`y = offset + step round((x - offset)/step)`: an exact lattice of values, or one blurred by what came after.
 
     Looks like white noise of variance `step^2/12`; the values on their lattice tell them apart. Noise added after the
-    rounding is no part of it.
+    rounding is no part of it. A simulation that rounds itself, to coarser steps, does so no more.
 
     Attributes:
         step: `(sensor,)`, unit of the signal; 0 where a sensor is not rounded.
@@ -54,6 +54,8 @@ class Quantization(Mechanism):
         blur: `(sensor,)`, sd of what was added after the rounding, steps.
         centre: Mean of what was rounded, `(sensor,)`, unit of the signal: where it lies between two steps makes what a
             few of them do to noise. A hidden lattice lies as far from the mean of a simulation, whose bias is its own.
+        replaced: Steps of the simulation's own rounding that it takes the place of, one for each sensor, likewise; 0
+            where it does not.
     """
 
     name: ClassVar[str] = "quantization"
@@ -64,18 +66,18 @@ class Quantization(Mechanism):
     offset: OfSensors
     blur: OfSensors
     centre: OfSensors
+    replaced: tuple[float, ...] = ()
 
     @classmethod
     def in_reference(cls, comparison: Comparison) -> Quantization | None:
         """The exact grids of a simulation's values, those fine enough to be undone; None without."""
-        side = comparison.reference
-        fine = [
-            own if own is not None and own.step < _UNDONE * float(sd) else None
-            for own, sd in zip(exact_lattices(side), innovation_sd(side), strict=True)
-        ]
-        if not any(fine):
+        side, fine = comparison.reference, _undone(comparison)
+        if not fine:
             return None
-        rows = [(0.0, 0.0) if own is None else (own.step, own.offset) for own in fine]
+        rows = [
+            own[:2] if own is not None and i in fine else Lattice.none()[:2]
+            for i, own in enumerate(exact_lattices(side))
+        ]
         step, offset = torch.tensor(rows, dtype=torch.float64).mT
         return cls(step, offset, torch.zeros_like(step), side.signal.mean((0, -1)))
 
@@ -101,7 +103,19 @@ class Quantization(Mechanism):
 
     def in_unit(self, factor: float) -> Quantization:
         """The same of numbers that are a factor larger."""
-        return replace(self, step=factor * self.step, offset=factor * self.offset, centre=factor * self.centre)
+        step, offset, centre = (factor * numbers for numbers in (self.step, self.offset, self.centre))
+        return replace(
+            self, step=step, offset=offset, centre=centre, replaced=tuple(factor * one for one in self.replaced)
+        )
+
+    def left_of(self, own: Sequence[Mechanism]) -> tuple[Mechanism, ...]:
+        kept = torch.tensor(self.replaced) == 0
+        return tuple(
+            replace(effect, step=torch.where(kept, effect.step, 0.0))
+            if self.replaced and isinstance(effect, Quantization)
+            else effect
+            for effect in own
+        )
 
     @classmethod
     def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
@@ -109,41 +123,65 @@ class Quantization(Mechanism):
         band = DeadBand.detect_and_fit(comparison, level)
         if band is not None:
             return band
-        p_value, found = missing_lattices(comparison, level)
-        if not found:
+        p_value, found, coarser = missing_lattices(comparison, level)
+        undone = _undone(comparison)
+        coarser = {i: own for i, own in coarser.items() if i in undone}
+        if not found and not coarser:
             return None
-        none = Lattice(0.0, 0.0, 0.0, 1.0)
-        rows = [found.get(i, none) for i in range(comparison.n_sensors)]
+        every = range(comparison.n_sensors)
+        rows = [found.get(i, Lattice.none()) for i in every]
         step, offset, blur = (torch.tensor([row[k] for row in rows], dtype=torch.float64) for k in range(3))
-        effect = cls(step, offset, blur, comparison.recording.mean(-1))._placed(comparison.recording)
-        sensors = tuple(found)
-        parameters = {}
-        for i in sensors:
+        replaced = tuple(coarser.get(i, Lattice.none()).step for i in every) if coarser else ()
+        effect = cls(step, offset, blur, comparison.recording.mean(-1), replaced)
+        effect = effect._placed(effect._values(comparison))
+        sensors = tuple(sorted({*found, *coarser}))
+        parameters = {
+            f"simulated_lsb[{i}]": Parameter(own.step, own.step, own.step, comparison.info.measure)
+            for i, own in coarser.items()
+        }
+        for i in found:
             value = float(step[i])
             reach = Z * effect._step_sd(i, comparison.recording[i])
             parameters[f"lsb[{i}]"] = Parameter(value, value - reach, value + reach, comparison.info.measure)
-        where = comparison.info.named(sensors, "all sensors")
-        steps = f"{_several(step[list(sensors)])} {comparison.info.measure}"
-        hidden = ", hidden under what was added later" if float(blur.max()) > 0 else ""
+        words = []
+        if found:
+            where = comparison.info.named(tuple(found), "all sensors")
+            hidden = ", hidden under what was added later" if float(blur.max()) > 0 else ""
+            words.append(
+                f"the rate is rounded to steps of {_several(step[list(found)])} {comparison.info.measure} in {where}"
+                f"{hidden}"
+            )
+        if coarser:
+            steps = _several(torch.tensor([own.step for own in coarser.values()], dtype=torch.float64))
+            theirs = f"the simulation rounds to steps of {steps} {comparison.info.measure}"
+            if set(coarser) == set(found):
+                words[-1] += f", where {theirs}"
+            else:
+                where = comparison.info.named(tuple(coarser), "all sensors")
+                words.append(f"{theirs} in {where}, the recording does not")
         coarse = _too_coarse(comparison.recording, found)
         if coarse:
-            hidden += (
-                f"; the noise of {comparison.info.named(coarse)} is so much smaller that nothing else can be told there"
+            words.append(
+                f"the noise of {comparison.info.named(coarse)} is so much smaller that nothing else can be told there"
             )
         return Finding(
             cls.name,
             effect,
-            f"the rate is rounded to steps of {steps} in {where}{hidden}",
+            "; ".join(words),
             p_value,
             sensors,
             parameters,
             levels=(1,),
-            gain=float(effect._scores(comparison.recording).sum()),
+            gain=float(effect._scores(comparison).sum()),
             hides=tuple(coarse),
         )
 
     def fit_without(self, comparison: Comparison, fold: int) -> Quantization:
-        return self._placed(comparison.recording[:, estimation_samples(comparison.n_samples, fold)])
+        return self._placed(self._values(comparison)[:, estimation_samples(comparison.n_samples, fold)])
+
+    def _values(self, comparison: Comparison) -> Tensor:
+        """The recording `(sensor, time)`, as it came where its lattice is exact."""
+        return torch.where(self.blur[:, None] > 0, comparison.recording, comparison.as_came.signal[0])
 
     def _placed(self, signal: Tensor) -> Quantization:
         """With offset and blur of samples `(sensor, time)`, for the steps as they are."""
@@ -153,7 +191,8 @@ class Quantization(Mechanism):
         return replace(self, offset=offset, blur=torch.where(self.blur > 0, blur, self.blur))
 
     def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
-        pictures.distance_from_grid(ax, comparison, sensor, float(self.step[sensor]), float(self.offset[sensor]))
+        step = float(self.step[sensor]) or self.replaced[sensor]  # where only the simulation has one, of that
+        pictures.distance_from_grid(ax, comparison, sensor, step, float(self.offset[sensor]))
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
         """Values get the law that they have in the recording, in the order in which they are.
@@ -167,17 +206,33 @@ class Quantization(Mechanism):
         return torch.where(self.step[:, None] > 0, torch.stack(moved).view_as(signal) * self._divisor + offset, signal)
 
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
-        return held_out_blocks(self._scores(comparison.recording), fold).sum((0, -1))
+        return held_out_blocks(self._scores(comparison), fold).sum((0, -1))
 
     @property
     def _divisor(self) -> Tensor:
         return torch.where(self.step > 0, self.step, 1.0)[:, None]
 
-    def _scores(self, signal: Tensor) -> Tensor:
-        """Log density of the distances from the lattice against an even one, `(sensor, time)`: a wrapped normal's."""
-        place = off_lattice(signal, self._divisor, self.offset[:, None])
-        blur = self.blur.clamp(min=_SHARPEST)[:, None]
-        return torch.where(self.step[:, None] > 0, _wrapped_normal(place, blur).clamp(min=1e-12).log(), 0.0)
+    def _scores(self, comparison: Comparison) -> Tensor:
+        """Log density of the distances from the lattice against an even one, `(sensor, time)`: a wrapped normal's.
+
+        Or against that of the simulation's lattice, where it has one.
+        """
+        signal = self._values(comparison)
+        scores = _log_density(signal, self.step, self.offset, self.blur)
+        if not self.replaced:
+            return scores
+        own = [
+            (Lattice.none() if not step or lattice is None else lattice)[:2]
+            for step, lattice in zip(self.replaced, exact_lattices(comparison.reference), strict=True)
+        ]
+        step, offset = torch.tensor(own, dtype=torch.float64).mT
+        return scores - _log_density(signal, step, offset, torch.zeros_like(step))
+
+    def apply_to_reference(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
+        """The simulation's own rounding goes where this one takes its place."""
+        sensors = [i for i, step in enumerate(self.replaced) if step]
+        comparison = comparison.without_converter(self.stage, sensors) if sensors else comparison
+        return super().apply_to_reference(comparison, generator)
 
     def _step_sd(self, sensor: int, signal: Tensor) -> float:
         """From the information of each distance on the lattice, as values spread over many steps."""
@@ -187,6 +242,23 @@ class Quantization(Mechanism):
         information = float((slope.square() / density.clamp(min=1e-12)).mean()) * 1024**2
         spread = float((signal / self.step[sensor]).std())
         return float(self.step[sensor]) / math.sqrt(max(information * len(signal) * spread**2, 1e-300))
+
+
+def _undone(comparison: Comparison) -> set[int]:
+    """Sensors whose exact grid in the simulation is fine enough to be undone."""
+    side = comparison.reference
+    return {
+        i
+        for i, (own, sd) in enumerate(zip(exact_lattices(side), innovation_sd(side), strict=True))
+        if own is not None and own.step < _UNDONE * float(sd)
+    }
+
+
+def _log_density(signal: Tensor, step: Tensor, offset: Tensor, blur: Tensor) -> Tensor:
+    """Of distances from a lattice against an even one, `(sensor, time)`, nats; 0 where there is no step."""
+    place = off_lattice(signal, torch.where(step > 0, step, 1.0)[:, None], offset[:, None])
+    density = _wrapped_normal(place, blur.clamp(min=_SHARPEST)[:, None])
+    return torch.where(step[:, None] > 0, density.clamp(min=1e-12).log(), 0.0)
 
 
 def _correlation(covariance: Tensor) -> Tensor:

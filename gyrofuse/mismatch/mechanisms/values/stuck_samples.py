@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.detectors.values.values import repeated, repeats, repeats_so_far
+from gyrofuse.mismatch.detectors.values.values import repeats, repeats_so_far
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
@@ -41,6 +41,8 @@ class StuckSamples(Mechanism):
         by_chance: `(sensor,)`, of a repeat without the mechanism.
         together: Whether all the sensors concerned repeat at the same time.
         row: Mean number of repeats one after the other, `(sensor,)`; `1 / (1 - p)` where it is empty.
+        filler: Value that stands in the place of samples, `(sensor,)`, unit of the signal; empty where the last one is
+            held.
     """
 
     name: ClassVar[str] = "stuck_samples"
@@ -51,6 +53,7 @@ class StuckSamples(Mechanism):
     by_chance: OfSensors
     together: bool
     row: tuple[float, ...] = ()
+    filler: tuple[float, ...] = ()
 
     @classmethod
     def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
@@ -62,11 +65,10 @@ class StuckSamples(Mechanism):
             return None
         effect = cls._estimated(comparison, sensors, torch.ones(comparison.n_samples, dtype=torch.bool))
         parameters = {}
-        same = repeated(comparison.recording)
         for i in sensors:
             value = float(effect.probability[i])
             own = float(found.share[i])
-            runs = run_lengths(same[i])
+            runs = run_lengths(found.same[i])
             # Samples that repeat one after the other are one event.
             clustered = float(runs.square().sum() / runs.sum()) if len(runs) else 1.0
             spread = math.sqrt(own * (1 - own) * clustered / found.n)
@@ -76,10 +78,15 @@ class StuckSamples(Mechanism):
         hangs = f", {longest:.0f} times one after the other" if longest > _LONG else ""
         largest = max(sensors, key=lambda i: float(effect.probability[i]))
         jointly = " at the same time" if effect.together else ""
+        unit = comparison.info.measure
+        what = "samples repeat the one before"
+        if effect.filler:
+            values = sorted({f"{effect.filler[i]:.6g}" for i in sensors})
+            what = f"samples are {' and '.join(values)} {unit}, which stands in their place"
         return Finding(
             cls.name,
             effect,
-            f"samples repeat the one before{hangs}{jointly} in {where}, with a probability of up to "
+            f"{what}{hangs}{jointly} in {where}, with a probability of up to "
             f"{float(effect.probability[largest]):.3g} (sensor {comparison.info.sensors[largest]}), "
             f"where the simulation has {float(effect.by_chance[largest]):.2g}",
             min(p_values),
@@ -91,7 +98,8 @@ class StuckSamples(Mechanism):
 
     @classmethod
     def _estimated(cls, comparison: Comparison, sensors: tuple[int, ...], keep: Tensor) -> StuckSamples:
-        same = repeated(comparison.recording)[:, keep]
+        every = repeats(comparison).same
+        same = every[:, keep]
         chance = repeats(comparison).expected.clamp(max=0.999)
         share = same.to(torch.float64).mean(-1)
         concerned = torch.zeros(comparison.n_sensors, dtype=torch.bool)
@@ -102,17 +110,21 @@ class StuckSamples(Mechanism):
         together = len(at) > 1 and jointly > _TOGETHER * float(probability[at].min())
         length = [
             _mean_row(row, float(c), float(p)) if p > 0 else 1.0
-            for row, c, p in zip(repeated(comparison.recording), chance, probability, strict=True)
+            for row, c, p in zip(every, chance, probability, strict=True)
         ]
-        return cls(probability, chance, together, tuple(length))
+        filler = [_filler(comparison.recording[i], every[i], max(length[i], _LONG)) for i in at]
+        known = [value for value in filler if value is not None]
+        put_out = dict(zip(at, known, strict=True)) if len(known) == len(at) else {}
+        fills = tuple(put_out.get(i, 0.0) for i in range(comparison.n_sensors)) if put_out else ()
+        return cls(probability, chance, together, tuple(length), fills)
 
     def fit_without(self, comparison: Comparison, fold: int) -> StuckSamples:
         keep = estimation_samples(comparison.n_samples, fold)
         return self._estimated(comparison, tuple(self.probability.nonzero()[:, 0].tolist()), keep)
 
     def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
-        repeats = repeated(comparison.recording)[sensor].nonzero()[:, 0]
-        first = int(repeats[0]) - 20 if len(repeats) else 0
+        again = repeats(comparison).same[sensor].nonzero()[:, 0]
+        first = int(again[0]) - 20 if len(again) else 0
         pictures.samples(ax, comparison, sensor, first, 60)
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
@@ -127,6 +139,10 @@ class StuckSamples(Mechanism):
             if self.together:
                 record[self.probability > 0] = record[largest].clone()
         held[..., 0] = False
+        if self.filler:  # in the place of the first one of a row as well
+            begins = torch.nn.functional.pad(held[..., 1:], (0, 1)) & (self.probability > 0)[:, None]
+            values = torch.tensor(self.filler, dtype=signal.dtype)[:, None]
+            return torch.where(held | begins, values, records).view(signal.shape)
         source = torch.where(held, 0, torch.arange(n)).cummax(-1).values
         return records.gather(-1, source).view(signal.shape)
 
@@ -149,7 +165,10 @@ class StuckSamples(Mechanism):
         for i in self.probability.nonzero()[:, 0].tolist():
             if self.row[i] > _LONG:
                 longest = _longest_by_chance(comparison.n_samples, float(self.by_chance[i]))
-                _fill(filled[i], comparison.reference.signal[0, i], longest)
+                rows = [row for row in runs_of(repeats(comparison).same[i]).tolist() if row[1] - row[0] > longest]
+                if self.filler:
+                    rows = runs_of(comparison.recording[i] == self.filler[i]).tolist()
+                _fill(filled[i], rows, comparison.reference.signal[0, i])
         return comparison.with_recording(filled)
 
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
@@ -160,7 +179,7 @@ class StuckSamples(Mechanism):
         # A simulation without any repeats does not say that they are impossible.
         chance = self.by_chance.clamp(min=0.5 / comparison.reference.signal[:, 0].numel())
         enter, leave = self._turns()
-        same = repeated(comparison.recording)
+        same = repeats(comparison).same
         held = torch.zeros(same.shape, dtype=torch.float64)
         for i in self.probability.nonzero()[:, 0].tolist():
             seen = _longest_by_chance(len(same[i]), float(chance[i])) if self._hangs_beside_chance(i) else 1.0
@@ -175,6 +194,17 @@ class StuckSamples(Mechanism):
 def run_lengths(true: Tensor) -> Tensor:
     """Lengths of the runs of true entries of `(time,)`, `(run,)`."""
     return runs_of(true).diff()[:, 0].to(torch.float64)
+
+
+def _filler(values: Tensor, same: Tensor, long: float) -> float | None:
+    """The value `(time,)` that nearly all rows of repeats beyond half a length have; None where they have their own."""
+    fewest, nearly_all = 3, 0.9
+    rows = runs_of(same)
+    rows = rows[rows.diff()[:, 0] > long / 2]
+    if len(rows) < fewest:
+        return None
+    own, counts = values[rows[:, 0]].unique(return_counts=True)
+    return float(own[counts.argmax()]) if int(counts.max()) > nearly_all * len(rows) else None
 
 
 def _rows(n: int, enter: float, leave: float, generator: torch.Generator) -> Tensor:
@@ -214,16 +244,15 @@ def _longest_by_chance(n: int, chance: float) -> float:
     return max(_LONG, math.log(1e3 * n) / -math.log(max(chance, 1e-12)))
 
 
-def _fill(signal: Tensor, simulated: Tensor, longest: float) -> None:
+def _fill(signal: Tensor, rows: list[list[int]], simulated: Tensor) -> None:
     """Put simulated noise, on a line from the mean before to that after, in the place of rows of repeats `(time,)`.
 
     Args:
         signal: Recording, `(time,)`, which is changed.
+        rows: First samples of the rows, and those after their last ones.
         simulated: Simulation, `(time,)`.
-        longest: Length beyond which rows are replaced.
     """
     near = 16  # samples of a mean
-    rows = [(a, b) for a, b in runs_of(repeated(signal)).tolist() if b - a > longest]
     whole = signal.clone()
     for a, b in rows:
         before, after = whole[max(a - 1 - near, 0) : a - 1], whole[b : b + near]

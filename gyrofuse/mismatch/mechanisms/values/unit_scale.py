@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
@@ -40,6 +41,7 @@ class UnitScale(Mechanism):
 
     name: ClassVar[str] = "parameter_shift"
     separated_by: ClassVar[str] = "a longer recording, or one of the same device under other conditions"
+    rescales: ClassVar[bool] = True
     factor: float
 
     @classmethod
@@ -50,6 +52,8 @@ class UnitScale(Mechanism):
         # A unit is one factor at all frequencies; other numbers of white noise move most bands, too.
         alike = ((ratios - middle[:, None]).abs() < _ALIKE).double().mean(-1) > _MOST
         if not bool(alike.all()):
+            return None
+        if not _at_all_times(comparison, middle):
             return None
         for size, words in _UNITS.items():
             for sign in (1, -1):
@@ -77,9 +81,8 @@ class UnitScale(Mechanism):
     def fit_in_place_of(cls, finding: Finding, comparison: Comparison) -> Rival | None:
         return None  # stands for no other noise
 
-    @property
-    def unit_factor(self) -> float:
-        return self.factor
+    def left_of(self, own: Sequence[Mechanism]) -> tuple[Mechanism, ...]:
+        return tuple(effect.in_unit(self.factor) for effect in own)
 
     def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
         pictures.ratio_of_spectra(ax, comparison, sensor, None)
@@ -95,3 +98,19 @@ class UnitScale(Mechanism):
 
     def fit_without(self, comparison: Comparison, fold: int) -> UnitScale:
         return self
+
+
+def _at_all_times(comparison: Comparison, factor: Tensor) -> bool:
+    """Whether most stretches are as much larger as the whole is: noise that is loud for a while is no unit.
+
+    Args:
+        comparison: Recording and simulation.
+        factor: Logarithms of the factors of all, `(sensor,)`.
+    """
+
+    def level(signal: Tensor) -> Tensor:
+        stretches = signal.tensor_split(32, -1)
+        return torch.stack([part.diff().square().mean(-1).log() for part in stretches]).median(0).values
+
+    over = (level(comparison.recording) - level(comparison.reference.signal).mean(0)) / 2
+    return bool(((over - factor).abs() < _ALIKE).all())
