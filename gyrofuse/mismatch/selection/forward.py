@@ -12,7 +12,7 @@ from gyrofuse.mismatch.decisions import NATS_AS_GOOD
 from gyrofuse.mismatch.mechanisms.catalogue import AGAIN, STAGES
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, repaired
 from gyrofuse.mismatch.selection.discrepancy import leads_away
-from gyrofuse.mismatch.selection.held_out import HeldOutScore, numbers_by_fold, score_held_out
+from gyrofuse.mismatch.selection.held_out import HeldOutScore, numbers_by_fold, score_held_out, share_of_record
 from gyrofuse.mismatch.selection.residue import is_left_of_form
 from gyrofuse.mismatch.signals.comparison import Comparison
 
@@ -114,7 +114,7 @@ def _held(
 ) -> HeldOutScore | None:
     """Score of a finding's effect on the blocks held out; None where it does not hold there, or leads away."""
     score, steady = score_held_out(comparison, effect), 0.2  # share of the record in which what never changes is seen
-    if effect.of_spectra and score.share_of_record < steady:  # what a pulse left, or an episode
+    if effect.of_spectra and share_of_record(score, comparison) < steady:  # what a pulse left, or an episode
         return None
     if score.confirms(finding.p_value) and not leads_away(start, comparison, score.by_fold, generator):
         return score

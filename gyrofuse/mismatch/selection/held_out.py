@@ -8,7 +8,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.likelihoods.spectra.slow_ordinates import slow_gains
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
+from gyrofuse.mismatch.mechanisms.spectra.spectral import Spectral
 from gyrofuse.mismatch.selection.classifier import distinguishability
 from gyrofuse.mismatch.selection.discrepancy import differences_of_fold, discrepancy_of_fold, paired_discrepancy
 from gyrofuse.mismatch.selection.shares import Share, shares_of
@@ -43,12 +45,6 @@ class HeldOutScore(NamedTuple):
     def sd(self) -> float:
         """Standard deviation of the total, from the scatter of the blocks."""
         return sd_of_sum(self.blocks)
-
-    @property
-    def share_of_record(self) -> float:
-        """Share of the blocks that gain, by their effective number."""
-        gained = self.blocks.clamp(min=0)
-        return float(gained.sum().square() / gained.square().sum().clamp(min=1e-300)) / len(gained)
 
     def confirms(self, p_value: float) -> bool:
         """Whether a finding of that p value holds on the blocks held out (the rule of one standard error).
@@ -132,6 +128,21 @@ def score_held_out(comparison: Comparison, effect: Mechanism) -> HeldOutScore:
         blocks[in_fold(N_JUDGED, fold)] = one.held_out_scores(comparison, fold)
     in_sample = sum(float(effect.held_out_scores(comparison, fold).sum()) for fold in range(N_FOLDS))
     return HeldOutScore(effect.likelihood, blocks, by_fold, in_sample)
+
+
+def share_of_record(score: HeldOutScore, comparison: Comparison) -> float:
+    """Share of the blocks that gain, by their effective number.
+
+    Slow ordinates of the whole record are of no block: what is seen in them most of all has no share, and counts as 1.
+    """
+    gained = score.blocks.clone()
+    for fold, one in enumerate(score.by_fold):
+        if isinstance(one, Spectral):
+            gained[in_fold(N_JUDGED, fold)] -= slow_gains(comparison, one.spectra, fold)
+    if float(gained.sum()) < score.total / 2:
+        return 1.0
+    gained = gained.clamp(min=0)
+    return float(gained.sum().square() / gained.square().sum().clamp(min=1e-300)) / len(gained)
 
 
 def numbers_by_fold(comparison: Comparison, effect: Mechanism) -> tuple[Mechanism, ...]:

@@ -95,6 +95,7 @@ def _level(transform: Tensor, edges: list[int]) -> Tensor:
     """A transform `(sensor, bin)` of the same level in all bands, where one was whitened with what was far off."""
     fewest, parts = 64, []  # bins, for a median that is known to a fifth
     for part in transform.split([b - a for a, b in itertools.pairwise(edges)], -1):
-        usual = part.abs().median(-1, keepdim=True).values.clamp(min=1e-300) / math.sqrt(math.log(2))
-        parts.append(part / usual if part.shape[-1] >= fewest else part)
+        if part.shape[-1] >= fewest:
+            part = part / (part.abs().median(-1, keepdim=True).values.clamp(min=1e-300) / math.sqrt(math.log(2)))
+        parts.append(part)
     return torch.cat(parts, -1)
