@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse.mismatch.likelihoods.spectra.mixing import mixing_of
+from gyrofuse.mismatch.likelihoods.spectra.mixing import mixing_of, of_known_powers
 
 MODELS = [
     gf.WhiteNoise(1.0) + gf.AR1(0.98, 0.02),
@@ -52,6 +52,42 @@ def test_of_alike_spectra_only_the_sum_is_known():
     assert float(found.matrix[0, 1]) == pytest.approx(float(found.matrix[1, 0]), abs=1e-3)
     for truth, value, sd in zip(mixing.flatten(), found.matrix.flatten(), found.sd.flatten(), strict=True):
         assert abs(float(truth - value)) <= 1.96 * float(sd)
+
+
+def test_known_powers_tell_the_mixing_of_alike_spectra_that_rotations_hide():
+    """Neighbours on one board, of white noise alike: coherences leave any rotation open, and the powers none."""
+    p, n_bands = 5, 40
+    shapes = torch.ones(n_bands, p, dtype=torch.float64)
+    mixing = torch.diag(torch.full((p - 1,), 0.3, dtype=torch.float64), 1)
+    mixing = mixing + mixing.mT
+    dof, eye = torch.full((n_bands,), 1e4, dtype=torch.float64), torch.eye(p, dtype=torch.complex128).repeat(40, 1, 1)
+    seen = spectra_of(mixing, shapes), dof, eye
+    found = of_known_powers(mixing_of(*seen), *seen, torch.diag_embed(shapes).to(torch.complex128))
+    assert torch.equal(found.free, mixing != 0)
+    assert torch.allclose(found.matrix, mixing, atol=1e-3)
+
+
+def test_powers_that_are_others_tell_nothing_of_a_mixing():
+    """A simulation may have other levels besides: what coherences tell stays."""
+    g = torch.Generator().manual_seed(2)
+    shapes = torch.rand(40, 3, generator=g, dtype=torch.float64) * 3 + 0.2
+    mixing = torch.tensor([[0, 0.2, 0], [0, 0, -0.1], [0, 0, 0]], dtype=torch.float64)
+    dof, eye = torch.full((40,), 1e5, dtype=torch.float64), torch.eye(3, dtype=torch.complex128).expand(40, 3, 3)
+    seen = spectra_of(mixing, shapes), dof, eye
+    found = of_known_powers(mixing_of(*seen), *seen, torch.diag_embed(torch.ones_like(shapes)).to(torch.complex128))
+    assert torch.allclose(found.matrix, mixing, atol=0.01)
+
+
+@pytest.mark.statistical
+def test_pairs_that_share_a_source_each_are_two_sources():
+    """Two supplies: the strongest direction of both is of neither, and no cross-talk either."""
+    g = torch.Generator().manual_seed(3)
+    recording, simulation = gf.WhiteNoise(1.0).simulate(2**14, batch=(2, 4), generator=g)
+    source = torch.randn(2, 2**14, generator=g, dtype=torch.float64)
+    report = gf.diagnose(recording + source.repeat_interleave(2, 0), simulation)
+    found = sorted((finding.mechanism, finding.sensors) for finding in report.findings)
+    assert found == [("common_mode", (0, 1)), ("common_mode", (2, 3))]
+    assert report.unexplained == ()
 
 
 def test_independent_sensors_have_none():

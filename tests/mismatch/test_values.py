@@ -15,7 +15,7 @@ from gyrofuse.mismatch.detectors.variance import outliers as impulses
 from gyrofuse.mismatch.detectors.variance.noise_level import variance_p_value
 from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
-from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
+from gyrofuse.mismatch.mechanisms.values.quantization import Quantization, _blurred
 from gyrofuse.mismatch.mechanisms.values.stuck_samples import StuckSamples
 from gyrofuse.mismatch.selection.held_out import score_held_out
 from gyrofuse.mismatch.signals import prediction_errors
@@ -360,3 +360,12 @@ def test_one_long_row_is_a_sensor_that_hangs() -> None:
     assert found.parameters["probability[1]"].value == pytest.approx(0.5, abs=0.01)
     after = settled(comparison, found, g)
     assert variance_p_value(after) > 0.001
+
+
+@pytest.mark.parametrize("blur", [0.0, 1e-12, 7e-7, 1e-4, 1e-2, 0.3])
+@pytest.mark.parametrize("spread", [0.7, 3.0])
+def test_rounding_gives_numbers_whatever_its_blur(blur: float, spread: float):
+    values = spread * torch.randn(4000, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    rounded = _blurred(values, blur)
+    assert bool(rounded.isfinite().all())
+    assert float((rounded - values).abs().max()) < 1.5

@@ -103,6 +103,11 @@ def leads_away(start: Comparison, comparison: Comparison, by_fold: tuple[Mechani
     return after > _FARTHER * max(before, 1.0)
 
 
+def is_farther(made: Comparison, before: Comparison) -> bool:
+    """Whether a simulation is farther from the recording than before, with its lines."""
+    return mean_discrepancy(made) > _FARTHER * max(mean_discrepancy(before), 1.0)
+
+
 def discrepancy_left(comparison: Comparison, after: float) -> TestResult | None:
     """The discrepancy as a test result where much of it is left beside known spectral lines; else None.
 

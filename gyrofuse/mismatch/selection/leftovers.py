@@ -10,7 +10,7 @@ import torch
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.mechanisms.catalogue import UNNAMED
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
-from gyrofuse.mismatch.selection.discrepancy import leads_away
+from gyrofuse.mismatch.selection.discrepancy import is_farther, leads_away
 from gyrofuse.mismatch.selection.held_out import HeldOutScore, score_held_out
 from gyrofuse.mismatch.signals.comparison import Comparison
 
@@ -53,7 +53,10 @@ def repair_leftovers(
             continue
         effect = kind.left_over(comparison).but_for(hidden)
         score = score_held_out(comparison, effect)
-        if score.confirms(min(p_values)) and not leads_away(start, comparison, score.by_fold, generator):
-            effects, scores = (*effects, effect), (*scores, score)
-            comparison = effect.repair(comparison, generator)
+        if not score.confirms(min(p_values)) or leads_away(start, comparison, score.by_fold, generator):
+            continue
+        made = effect.repair(comparison, generator)
+        if is_farther(made, comparison):  # beside the simulation's lines, which what has no name filters as well
+            continue
+        effects, scores, comparison = (*effects, effect), (*scores, score), made
     return Leftovers(effects, scores, comparison)

@@ -77,6 +77,13 @@ def left_out(side: Records) -> LeftOut:
     return LeftOut(error, sd, z / sd[..., None], white / _sd(white, coarse)[..., None], at_ends, grain)
 
 
+def predicted(side: Records, at: Tensor, generator: torch.Generator) -> Tensor:
+    """The first record `(sensor, time)` with some samples predicted from all others, with noise as the others have."""
+    expected = left_out(side)
+    noise = torch.randn(at.shape, generator=generator, dtype=torch.float64) * expected.sd[0][:, None]
+    return torch.where(at, side.signal[0] - expected.correctable()[0] + noise, side.signal[0])
+
+
 def scaled_innovations(signal: Tensor, factors: Tensor) -> Tensor:
     """Signals `(..., time)` whose innovations were multiplied by factors `(..., time)`: of the same smooth spectrum.
 

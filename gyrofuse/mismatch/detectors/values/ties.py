@@ -87,17 +87,23 @@ def recurring(sensor: int, values: Tensor, value: float | None = None) -> Recurr
     unique, counts = torch.unique(values[new], return_counts=True)
     if len(unique) < 4 * _NEIGHBOURS:
         return None
-    at = int(counts[1:-1].argmax()) + 1  # ends are a matter of limits
+    at = int(counts.argmax())
+    if at in (0, len(unique) - 1) and not stands_alone(
+        values[values != unique[at]], float(unique[at]), int(counts[at])
+    ):
+        at = int(counts[1:-1].argmax()) + 1  # ends are a matter of limits
     # However wide a band is, half of the values beside it are their own; else they recur by their resolution.
     if len(unique) < 0.5 * int(counts.sum() - counts[at]):
         return None
     if value is not None:
-        at = min(max(int(torch.searchsorted(unique, value)), 1), len(unique) - 2)
+        at = min(int(torch.searchsorted(unique, value)), len(unique) - 1)
     if float(unique[at]) != value if value is not None else int(counts[at]) < _FEWEST:
         return None
     low, high = max(at - _NEIGHBOURS, 0), min(at + _NEIGHBOURS, len(unique) - 1)
     finest = float(unique[max(at - 4096, 0) : at + 4097].diff().min())
-    gap = float(unique[at + 1] - unique[at - 1])
+    below = float(unique[at - 1]) if at else -math.inf
+    above = float(unique[at + 1]) if at + 1 < len(unique) else math.inf
+    gap = above - below if math.isfinite(above - below) else 0.0
     around = torch.cat([counts[low:at], counts[at + 1 : high + 1]]).to(torch.float64)
     density = float(around.sum()) / max(float(unique[high] - unique[low]) - gap, 1e-300)
     return Recurring(
@@ -111,10 +117,19 @@ def recurring(sensor: int, values: Tensor, value: float | None = None) -> Recurr
         effective_samples=int(around.sum()),
         middle=float(values.mean()),
         spread=float(values.std()),
-        below=float(unique[at - 1]),
-        above=float(unique[at + 1]),
+        below=below,
+        above=above,
         n_values=len(unique) if value is None else 1,
     )
+
+
+def stands_alone(others: Tensor, value: float, times: int) -> bool:
+    """Whether a value at the end of all others `(time,)` occurs more often than any that was cut there would.
+
+    Tails fall: half a standard deviation before an end stop there are more values than beyond it.
+    """
+    near = float((others - value).abs().le(others.std() / 2).sum())
+    return near < times / 4
 
 
 def missing_recurrences(comparison: Comparison) -> dict[int, tuple[Recurring, float]]:

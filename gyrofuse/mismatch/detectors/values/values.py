@@ -13,7 +13,7 @@ from torch import Tensor
 from gyrofuse.mismatch.decisions import CERTAIN, CHANCE
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.detectors.values.quantisation_grid import distinct_values, missing_lattices
-from gyrofuse.mismatch.detectors.values.ties import missing_recurrences
+from gyrofuse.mismatch.detectors.values.ties import missing_recurrences, stands_alone
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.prediction_errors import left_out
@@ -90,7 +90,25 @@ def repeats(comparison: Comparison) -> Repeats:
     row = n * by_resolution.clamp(min=1 / n).pow(longest)  # expected number of rows as long, each value by chance
     hanging = np.minimum(by_resolution_alone, row.numpy())
     counted = np.where(hangs.numpy(), hanging, np.maximum(compared, by_resolution_alone))
-    return Repeats(same[:, 0], share, expected, sd, torch.from_numpy(np.where(few.numpy() < 20.0, counted, many)), n)
+    p_values = torch.from_numpy(np.where(few.numpy() < 20.0, counted, many))
+    coarser = _met_as_often_later(comparison.observed.signal.movedim(1, 0), share, expected, longest)
+    return Repeats(same[:, 0], share, expected, sd, torch.where(coarser, 1.0, p_values), n)
+
+
+def _met_as_often_later(signal: Tensor, share: Tensor, expected: Tensor, longest: Tensor) -> Tensor:
+    """Whether samples `(sensor, record, time)` equal later ones about as often as the next one, `(sensor,)`.
+
+    Values are coarser then, by whatever lattice; a sample that is read twice is no more like the one after next. Rows
+    far longer than those of chance are those of a sensor that hangs.
+    """
+    lags, beyond_chance = torch.arange(3, 7), 4.0
+    later = torch.stack(
+        [(signal[..., lag:] == signal[..., :-lag]).to(torch.float64).mean((1, 2)) for lag in lags.tolist()]
+    ).mean(0)
+    excess = (share - expected).clamp(min=0)
+    twice = excess.pow(lags[:, None]).mean(0)  # of samples that repeat one by one
+    by_chance = math.log(1e3 * signal[0].numel()) / -share.clamp(1e-12, 1 - 1e-12).log()
+    return (later - expected > (excess + twice) / 2) & (longest < beyond_chance * by_chance)
 
 
 def _events(same: Tensor) -> Tensor:
@@ -172,7 +190,8 @@ def end_stops(comparison: Comparison) -> tuple[EndStop, ...]:
 def _filled_in(comparison: Comparison, sensor: int, at: Tensor, far: float) -> bool:
     """Whether the largest or smallest value stands in the place of samples that are not there.
 
-    Next to an end stop there are values; and where it holds for long, others do not hang.
+    Next to an end stop there are values, more than beyond it (`stands_alone`); and where it holds for long, others do
+    not hang.
 
     Args:
         comparison: Recording and simulation.
@@ -186,7 +205,9 @@ def _filled_in(comparison: Comparison, sensor: int, at: Tensor, far: float) -> b
     others = (same & ~ends).any(0)
     elsewhere = x[sensor, ~at]
     gap = float((elsewhere - x[sensor, at][0]).abs().min()) if len(elsewhere) else 0.0
-    return gap > far or (int(held.sum()) > 8 and int((held & others).sum()) > 0.9 * int(held.sum()))
+    if gap > far or (len(elsewhere) and stands_alone(elsewhere, float(x[sensor, at][0]), int(at.sum()))):
+        return True
+    return int(held.sum()) > 8 and int((held & others).sum()) > 0.9 * int(held.sum())
 
 
 def _regressed(x: Tensor, mean: Tensor, step: float) -> tuple[Tensor, float]:

@@ -107,7 +107,7 @@ class Common(Term):
         aligned[1] = False
         forms = [
             replace(self, free=aligned, local=self.local * aligned),
-            replace(self, free=torch.ones_like(self.free)),
+            replace(self, free=self.free.any(0).expand_as(self.free)),
         ]
         whole = (ground.density / self.shape(ground, self.shared)).amin(-1).sqrt()
         size = (self.variance.sqrt() / whole).clamp(min=most)

@@ -7,7 +7,9 @@ powers at their likeliest,
 
 with the coherences `K_b` of `M^-1 S_b M^-T`. It is largest where those are as near to `C_b` as they can be in all bands
 together; of independent `y`, where the matrices are as diagonal as they can be (Pham). What a sensor has of another one
-is told from what that one has of it by their spectra alone: of alike ones only the sum is known.
+is told from what that one has of it by their spectra alone: of alike ones, and white ones above all, any rotation does
+as well. Where `y` has the spectra of a simulation, powers tell more: of what coherences leave open the mixing is chosen
+that the likelihood of the whole matrices prefers, `-sum_b d_b [log |M Y_b M^T| + tr (M Y_b M^T)^-1 S_b]`.
 
 References:
     Pham, Joint approximate diagonalization of positive definite Hermitian matrices, SIAM Journal on Matrix Analysis and
@@ -16,6 +18,7 @@ References:
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -111,6 +114,81 @@ def mixing_of(spectra: Tensor, dof: Tensor, coherence: Tensor, free: Tensor | No
         scatter = first_sd
     sd = _solved(*seen.normal_equations(matrix), chosen, max(scatter, 1e-6))[1]
     return Mixing(matrix, chosen, sd, seen.log_likelihood(matrix) - seen.log_likelihood(torch.zeros_like(matrix)))
+
+
+def of_known_powers(found: Mixing, spectra: Tensor, dof: Tensor, coherence: Tensor, unmixed: Tensor) -> Mixing:
+    """The mixing that the powers of a simulation prefer among those that coherences leave open; else the same.
+
+    Args:
+        found: The one that coherences alone prefer.
+        spectra: Cross-spectra of a recording, `(band, sensor, sensor)`.
+        dof: Complex ordinates of each, `(band,)`.
+        coherence: What the simulation's sensors share, `(band, sensor, sensor)`.
+        unmixed: Cross-spectra of the simulation, `(band, sensor, sensor)`.
+    """
+    if not bool(found.free.any()):
+        return found
+    free, seen = found.free, _Seen(spectra, dof, coherence)
+    matrix, sd, value = _scored(spectra, dof, unmixed, free)
+    while int(free.sum()) > 2:
+        # Either of two may stand for the other: pairs have nothing where both together have nothing.
+        size = torch.where(free, (matrix + matrix.mT).abs() / (sd.square() + sd.mT.square()).sqrt(), math.inf)
+        i, j = divmod(int(size.argmin()), len(free))
+        fewer = free.clone()
+        fewer[i, j] = fewer[j, i] = False
+        without = _scored(spectra, dof, unmixed, fewer)
+        if value - without[2] > NATS_PER_NUMBER * int((free & ~fewer).sum()):
+            break
+        free, (matrix, sd, value) = fewer, without
+    gain = seen.log_likelihood(matrix) - seen.log_likelihood(torch.zeros_like(matrix))
+    known = Mixing(matrix, free, sd, gain)
+    return known if known.worth > found.worth - NATS_PER_NUMBER * int(found.free.sum()) else found
+
+
+def _scored(spectra: Tensor, dof: Tensor, unmixed: Tensor, free: Tensor) -> tuple[Tensor, Tensor, float]:
+    """Entries of most likelihood with known powers, their standard deviations, and it, by Fisher's scoring.
+
+    Rotations that change nothing are drawn to none: of alike spectra the mixing is symmetric then.
+    """
+    rounds, least, wide = 40, 1e-7, 0.3  # wide: standard deviation of the prior
+    p, (rows, columns) = len(free), free.nonzero(as_tuple=True)
+    eye, matrix = torch.eye(p, dtype=torch.float64), torch.zeros(p, p, dtype=torch.float64)
+
+    def log_posterior(matrix: Tensor) -> float:
+        mixed = (eye + matrix).to(unmixed.dtype)
+        whole = mixed @ unmixed @ mixed.mT
+        surprise = torch.linalg.solve(whole, spectra).diagonal(dim1=-2, dim2=-1).real.sum(-1)
+        fit = (dof * (torch.linalg.slogdet(whole).logabsdet + surprise)).sum()
+        return -float(fit + (matrix / wide).square().sum() / 2)
+
+    value = log_posterior(matrix)
+    for _ in range(rounds):
+        mixed = (eye + matrix).to(unmixed.dtype)
+        half = unmixed @ mixed.mT  # Y M^T
+        inverse = torch.linalg.inv(mixed @ half)
+        slopes = torch.zeros(len(rows), len(dof), p, p, dtype=unmixed.dtype)  # of the whole matrices
+        for k, (i, j) in enumerate(zip(rows.tolist(), columns.tolist(), strict=True)):
+            slopes[k, :, i] += half[:, j]
+            slopes[k, :, :, i] += half[:, j].conj()
+        turned = inverse @ slopes
+        residual = inverse @ (spectra - mixed @ half)
+        score = torch.einsum("b,kbij,bji->k", dof.to(turned.dtype), turned, residual).real - matrix[free] / wide**2
+        information = torch.einsum("b,kbij,lbji->kl", dof.to(turned.dtype), turned, turned).real
+        information += torch.eye(len(rows), dtype=information.dtype) / wide**2
+        step = torch.linalg.solve(information, score)
+        shorter = 1.0
+        while True:
+            new = matrix.clone()
+            new[free] += shorter * step
+            if (made := log_posterior(new)) >= value or shorter < least:
+                break
+            shorter /= 2
+        moved, matrix, value = float((new - matrix).abs().max()), new, made
+        if moved < least:
+            break
+    sd = torch.zeros_like(matrix)
+    sd[free] = torch.linalg.inv(information).diagonal().sqrt()
+    return matrix, sd, value
 
 
 def _settled(seen: _Seen, matrix: Tensor, free: Tensor, prior_sd: float) -> Tensor:

@@ -120,8 +120,41 @@ def closest_starts(data: Ratios, beside: Pieces, families: Sequence[Term]) -> li
 
 
 def common_starts(data: Ratios, company: Sequence[Term]) -> Iterator[Common]:
-    """Sources of white noise, walks and AR1s that sensors may share, of AR1s the likeliest corner."""
-    ground, excess = data.ground, data.observed - data_model(data, company)
+    """Sources of white noise, walks and AR1s that sensors may share, of AR1s the likeliest corner.
+
+    Those of all sensors, and where some share nothing with others those of each group alone: the strongest direction of
+    two sources together is one of neither.
+    """
+    excess = data.observed - data_model(data, company)
+    yield from _common_starts(data, company, excess)
+    for group in _groups(data, excess):
+        alone = excess * (group[:, None] & group)
+        for start in _common_starts(data, company, alone):
+            yield start.only(start.free & group)
+
+
+def _groups(data: Ratios, excess: Tensor) -> list[Tensor]:
+    """Sensors that hang together by what they share, `(sensor,)` each, where that is not all of them.
+
+    Args:
+        data: What is to be explained.
+        excess: Cross-spectra beyond a model, over the noise's densities, `(band, sensor, sensor)`.
+    """
+    surely = 5.0  # standard deviations of a sum of squared coherences
+    p, power = data.n_sensors, data.observed.diagonal(dim1=-2, dim2=-1).real.clamp(min=1e-300)
+    squared = excess.abs().square() / (power[:, :, None] * power[:, None, :])
+    dof = data.pair_dof[:, None, None]
+    bands = (data.pair_dof > 0).sum().clamp(min=1)
+    z = ((dof * squared).sum(0) - bands) / bands.sqrt()  # squared coherences of ordinates of chance are exponential
+    linked = (z > surely) | torch.eye(p, dtype=torch.bool)
+    for _ in range(p.bit_length()):
+        linked = linked.to(torch.float64) @ linked.to(torch.float64) > 0
+    groups = {tuple(row.tolist()) for row in linked if 1 < int(row.sum()) < p}
+    return [torch.tensor(group) for group in sorted(groups, reverse=True)]
+
+
+def _common_starts(data: Ratios, company: Sequence[Term], excess: Tensor) -> Iterator[Common]:
+    ground = data.ground
     for kind in ("white", "walk"):
         yield from Common.starts(ground, excess, data.information, kind, torch.zeros(0, dtype=torch.float64))
     lowest, n_corners = 8 * float(ground.bands.frequency[0]), 8

@@ -28,7 +28,7 @@ from gyrofuse.mismatch.mechanisms.regimes.outlier_limits import with_limits
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples, held_out_blocks
-from gyrofuse.mismatch.signals.prediction_errors import left_out
+from gyrofuse.mismatch.signals.prediction_errors import left_out, predicted
 from gyrofuse.mismatch.stats.segments import episodes_of, two_level_scores
 
 if TYPE_CHECKING:
@@ -199,14 +199,8 @@ class Spikes(Mechanism):
         plain = self.amplitude >= _PLAIN * expected.sd[0]
         if not bool(plain[self.rate > 0].all()):
             return super().repair(comparison, generator)
-        noise = (
-            torch.randn(comparison.recording.shape, generator=generator, dtype=torch.float64) * expected.sd[0][:, None]
-        )
-        error = expected.correctable()[0]
-        predicted = comparison.recording - error + noise
-        return comparison.with_recording(
-            torch.where(self._outliers(comparison, error), predicted, comparison.recording)
-        )
+        outliers = self._outliers(comparison, expected.correctable()[0])
+        return comparison.with_recording(predicted(comparison.observed, outliers, generator))
 
     def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
         pictures.tails(ax, comparison, sensor)
@@ -284,15 +278,17 @@ def _limited(z: Tensor, laws: list[Outliers], hit: tuple[int, ...]) -> list[Outl
 def _shock(comparison: Comparison, apart: list[Outliers], hit: tuple[int, ...]) -> tuple[list[Outliers], float] | None:
     """Laws of outliers that hit several sensors at once, and what they gain, nats."""
     z, weak = left_out(comparison.observed).z[0], likely_outliers(comparison)
+    starts = [(hit, [law._replace(rate=max((apart[i].rate for i in hit), default=0.0)) for law in apart])]
     if weak is not None and weak.shock:
-        hit = tuple((weak.sensors > 0.5).nonzero()[:, 0].tolist())
-        start = [Outliers(weak.rate, weak.size, 0.1 * weak.size)] * len(z)
-    else:
-        start = [law._replace(rate=max((apart[i].rate for i in hit), default=0.0)) for law in apart]
-    if len(hit) < 2:
-        return None
-    laws = fitted_shock(z, [law if i in hit else Outliers.none() for i, law in enumerate(start)], _ROUNDS)
-    return laws, float(_shock_gains(z, laws).sum())
+        likely = tuple((weak.sensors > 0.5).nonzero()[:, 0].tolist())
+        starts.append((likely, [Outliers(weak.rate, weak.size, 0.1 * weak.size)] * len(z)))
+    found = []
+    for sensors, start in starts:
+        if len(sensors) > 1:
+            laws = [law if i in sensors else Outliers.none() for i, law in enumerate(start)]
+            laws = fitted_shock(z, laws, _ROUNDS)
+            found.append((laws, float(_shock_gains(z, laws).sum())))
+    return max(found, key=lambda entry: entry[1], default=None)
 
 
 def _shock_gains(z: Tensor, laws: list[Outliers]) -> Tensor:

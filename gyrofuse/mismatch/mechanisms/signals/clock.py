@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 _MILLION = 1e6
 _ROUNDS, _BLOCKS_AROUND = 2, 3  # of times of losses and amplitudes in turns, and blocks around each that are searched
+_FURTHER = 3  # times that more losses are looked for behind those that were found
 _AS_GOOD = 2.0  # nats within which another sample is as good: the 95 % limits of a likelihood ratio
 
 
@@ -68,9 +69,16 @@ class ClockSkew(Mechanism):
         everywhere = torch.ones(comparison.n_samples, dtype=torch.bool)
         effect = effect._fitted(comparison, everywhere)
         limits = [loss.at_limits for loss in slip.losses]
+        span: tuple[int, int] | None = slip.lost
         for _ in range(_ROUNDS if losses else 0):
             effect, limits = effect._placed(comparison)
             effect = effect._fitted(comparison, everywhere)
+        for _ in range(_FURTHER if losses else 0):
+            more = effect._with_what_is_left(comparison, level)
+            if more is None:
+                break
+            effect, limits = more._placed(comparison)
+            span = None
         losses = effect.losses
         who = info.named(slip.sensors, "all sensors")
         against = f"the tone at {slip.frequency * rate:.6g} Hz in "
@@ -80,7 +88,7 @@ class ClockSkew(Mechanism):
         if losses:
             lost = sum(count for _, count in losses)
             counted = f"{lost} sample{'s' if lost > 1 else ''}"
-            parameters = {"lost": Parameter(lost, *slip.lost, "")}
+            parameters = {"lost": Parameter(lost, *(span or (lost, lost)), "")}
             for j, ((at, _), (first, last)) in enumerate(zip(losses, limits, strict=True)):
                 parameters[f"time_of_loss_{j + 1}"] = Parameter(at / rate, first / rate, last / rate, "s")
             times = ", ".join(f"{at / rate:.4g}" for at, _ in losses)
@@ -152,6 +160,24 @@ class ClockSkew(Mechanism):
             losses[j] = low + int(gain.argmax()), count
             limits.append((low + int(likely[0]), low + int(likely[-1])))
         return replace(self, losses=tuple(losses)), limits
+
+    def _with_what_is_left(self, comparison: Comparison, level: float) -> ClockSkew | None:
+        """With the losses that show once these are made room for; None where none do, or the tone is no more in phase.
+
+        A loss next to one that is known says that more were lost there.
+        """
+        slip = strongest_slip(comparison.with_recording(self.remove(comparison.recording, comparison.info)))
+        if slip is None or slip.p_value > level or not slip.losses or slip.sensors != self.sensors:
+            return None
+        losses, near = dict(self.losses), _BLOCKS_AROUND * (comparison.n_samples // BLOCKS)
+        for loss in slip.losses:
+            at = loss.at - sum(count for start, count in self.losses if start <= loss.at)
+            known = min(losses, key=lambda start: abs(start - at))
+            at = known if abs(known - at) <= near else max(at, 1)
+            losses[at] = losses.get(at, 0) + loss.count
+        more = replace(self, losses=tuple(sorted(losses.items())))
+        more = more._fitted(comparison, torch.ones(comparison.n_samples, dtype=torch.bool))
+        return more if float(more.slipping.abs().square().sum()) > float(self.slipping.abs().square().sum()) else None
 
     def fit_without(self, comparison: Comparison, fold: int) -> ClockSkew:
         keep = estimation_samples(comparison.n_samples, fold)

@@ -13,8 +13,8 @@ from gyrofuse.mismatch.decisions import NATS_AS_GOOD, NEW_TERM_NATS
 from gyrofuse.mismatch.detectors.spectra.pooled_coherence import common_source
 from gyrofuse.mismatch.likelihoods.declared import declared
 from gyrofuse.mismatch.likelihoods.spectra.coherence import coherence_of, smooth_coherence
-from gyrofuse.mismatch.likelihoods.spectra.data import block_spectra
-from gyrofuse.mismatch.likelihoods.spectra.mixing import Mixing, mixing_of
+from gyrofuse.mismatch.likelihoods.spectra.data import block_spectra, reference_noise
+from gyrofuse.mismatch.likelihoods.spectra.mixing import Mixing, mixing_of, of_known_powers
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter, Rival
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import leading_shape
@@ -136,13 +136,22 @@ def _source_instead(comparison: Comparison, mixing: CrossTalk) -> _SourceInstead
     source = next((made for kind in declared(Spectral) if (made := kind.from_term(best.term, comparison))), None)
     if source is None:
         return None
-    own, other = (_held_out(one, comparison) for one in (mixing, replace(source, company=best.company)))
+    # Elsewhere something else may mix sensors, or be a source: one name competes with one.
+    same = _linked(mixing.mixing, best.term.free.any(0))
+    beside = replace(mixing, mixing=mixing.mixing * same)
+    own, other = (_held_out(one, comparison) for one in (beside, replace(source, company=best.company)))
     more, chance = float((own - other).sum()), max(2 * sd_of_sum(own - other), NATS_AS_GOOD)
     if more < -chance:
         return None
     if more > chance:
         return _SourceInstead(least=best.gain + 1)
     return _SourceInstead((source.name,), most=best.gain - 1)
+
+
+def _linked(mixing: Tensor, sensors: Tensor) -> Tensor:
+    """Sensors, of some and those that these are mixed with, directly or by others, `(sensor,)`."""
+    linked = ((mixing != 0) | (mixing.mT != 0)).to(torch.float64) + torch.eye(len(mixing), dtype=torch.float64)
+    return torch.linalg.matrix_power(linked, len(mixing)) @ sensors.to(torch.float64) > 0
 
 
 def _held_out(effect: Spectral, comparison: Comparison) -> Tensor:
@@ -189,4 +198,8 @@ def _mixing(comparison: Comparison, blocks: Tensor, free: Tensor | None = None) 
         simulated, ordinates = both.reference.mean(torch.ones(N_FOLDS, dtype=torch.bool))
         shared = smooth_coherence(coherence_of(simulated), ordinates)
         dof = dof * ordinates / (dof + ordinates).clamp(min=1e-300)
-    return mixing_of(matrices[known], dof[known], shared[known], free)
+    power = reference_noise(comparison).spectrum(both.bands.frequency)  # (sensor, band)
+    size = power.mT.sqrt()
+    unmixed = shared * (size[:, :, None] * size[:, None, :])
+    seen = matrices[known], dof[known], shared[known]
+    return of_known_powers(mixing_of(*seen, free), *seen, unmixed[known])

@@ -298,7 +298,7 @@ def _blurred(place: Tensor, blur: float) -> Tensor:
 
 def _pulled(place: Tensor, blur: float) -> Tensor:
     """Even distances from a lattice, steps, mapped in order to those of a wrapped normal variable."""
-    if blur == 0:
+    if blur < 1 / _TABLE:  # a wrapped normal narrower than a cell of the table has no density there
         return torch.zeros_like(place)
     edges = torch.linspace(-0.5, 0.5, _TABLE + 1, dtype=torch.float64)
     middle = (edges[1:] + edges[:-1]) / 2

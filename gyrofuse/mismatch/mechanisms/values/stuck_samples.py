@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.detectors.values.ties import missing_recurrences
 from gyrofuse.mismatch.detectors.values.values import repeats, repeats_so_far
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
@@ -16,6 +17,7 @@ from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples, held_out_blocks
+from gyrofuse.mismatch.signals.prediction_errors import predicted
 from gyrofuse.mismatch.stats.limits import Z
 from gyrofuse.mismatch.stats.multiplicity import sidak
 from gyrofuse.mismatch.stats.segments import runs_of
@@ -42,7 +44,7 @@ class StuckSamples(Mechanism):
         together: Whether all the sensors concerned repeat at the same time.
         row: Mean number of repeats one after the other, `(sensor,)`; `1 / (1 - p)` where it is empty.
         filler: Value that stands in the place of samples, `(sensor,)`, unit of the signal; empty where the last one is
-            held.
+            held. Without rows it stands for single ones.
     """
 
     name: ClassVar[str] = "stuck_samples"
@@ -62,7 +64,7 @@ class StuckSamples(Mechanism):
         band = DeadBand.detect_and_fit(comparison, level)  # puts out its value several times running as well
         sensors = tuple(i for i, p in enumerate(p_values) if p <= level and (band is None or i not in band.sensors))
         if not sensors:
-            return None
+            return cls._filled_in(comparison, level, () if band is None else band.sensors)
         effect = cls._estimated(comparison, sensors, torch.ones(comparison.n_samples, dtype=torch.bool))
         parameters = {}
         for i in sensors:
@@ -97,6 +99,61 @@ class StuckSamples(Mechanism):
         )
 
     @classmethod
+    def _filled_in(cls, comparison: Comparison, level: float, but_for: tuple[int, ...]) -> Finding | None:
+        """A value that stands for single samples, as where a read failed; it recurs, and others do not."""
+        found = {
+            i: pair for i, pair in missing_recurrences(comparison).items() if pair[1] <= level and i not in but_for
+        }
+        if not found:
+            return None
+        p, info, n = comparison.n_sensors, comparison.info, comparison.n_samples
+        sensors, filler, chance = tuple(sorted(found)), [0.0] * p, torch.zeros(p, dtype=torch.float64)
+        for i, (value, _) in found.items():
+            filler[i], chance[i] = value.value, value.expected / n
+        nothing = torch.zeros(p, dtype=torch.float64)
+        nothing[list(sensors)] = 1.0
+        whole = torch.ones(n, dtype=torch.bool)
+        effect = cls(nothing, chance, False, (), tuple(filler))._with_share(comparison, whole)
+        parameters = {}
+        for i in sensors:
+            share = float(effect.probability[i])
+            reach = Z * math.sqrt(share * (1 - share) / n)
+            parameters[f"probability[{i}]"] = Parameter(share, max(share - reach, 0.0), min(share + reach, 1.0), "")
+        largest = max(sensors, key=lambda i: float(effect.probability[i]))
+        values = sorted({f"{filler[i]:.6g}" for i in sensors})
+        return Finding(
+            cls.name,
+            effect,
+            f"single samples are {' and '.join(values)} {info.measure}, which stands in their place"
+            f"{' at the same time' if effect.together else ''} in {info.named(sensors, 'all sensors')}, with a "
+            f"probability of up to {float(effect.probability[largest]):.3g} (sensor {info.sensors[largest]})",
+            min(pair[1] for pair in found.values()),
+            sensors,
+            parameters,
+            levels=(1,),
+            gain=float(effect._scores(comparison).sum()),
+        )
+
+    def _with_share(self, comparison: Comparison, keep: Tensor) -> StuckSamples:
+        """With the share of the samples to keep that a value stands for."""
+        held = self._held(comparison)[:, keep]
+        share = torch.where(self.probability > 0, held.to(torch.float64).mean(-1), 0.0)
+        at = self.probability.nonzero()[:, 0].tolist()
+        jointly = float(held[at].all(0).to(torch.float64).mean() - share[at].prod())
+        return replace(self, probability=share, together=len(at) > 1 and jointly > _TOGETHER * float(share[at].min()))
+
+    @property
+    def _single(self) -> bool:
+        """Whether a value stands for single samples."""
+        return bool(self.filler) and not self.row
+
+    def _held(self, comparison: Comparison) -> Tensor:
+        """Samples that are none of their own, `(sensor, time)`."""
+        if not self._single:
+            return repeats(comparison).same
+        return comparison.recording == torch.tensor(self.filler, dtype=torch.float64)[:, None]
+
+    @classmethod
     def _estimated(cls, comparison: Comparison, sensors: tuple[int, ...], keep: Tensor) -> StuckSamples:
         every = repeats(comparison).same
         same = every[:, keep]
@@ -120,10 +177,12 @@ class StuckSamples(Mechanism):
 
     def fit_without(self, comparison: Comparison, fold: int) -> StuckSamples:
         keep = estimation_samples(comparison.n_samples, fold)
+        if self._single:
+            return self._with_share(comparison, keep)
         return self._estimated(comparison, tuple(self.probability.nonzero()[:, 0].tolist()), keep)
 
     def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
-        again = repeats(comparison).same[sensor].nonzero()[:, 0]
+        again = self._held(comparison)[sensor].nonzero()[:, 0]
         first = int(again[0]) - 20 if len(again) else 0
         pictures.samples(ax, comparison, sensor, first, 60)
 
@@ -140,9 +199,10 @@ class StuckSamples(Mechanism):
                 record[self.probability > 0] = record[largest].clone()
         held[..., 0] = False
         if self.filler:  # in the place of the first one of a row as well
-            begins = torch.nn.functional.pad(held[..., 1:], (0, 1)) & (self.probability > 0)[:, None]
+            if not self._single:
+                held |= torch.nn.functional.pad(held[..., 1:], (0, 1)) & (self.probability > 0)[:, None]
             values = torch.tensor(self.filler, dtype=signal.dtype)[:, None]
-            return torch.where(held | begins, values, records).view(signal.shape)
+            return torch.where(held, values, records).view(signal.shape)
         source = torch.where(held, 0, torch.arange(n)).cummax(-1).values
         return records.gather(-1, source).view(signal.shape)
 
@@ -158,7 +218,12 @@ class StuckSamples(Mechanism):
         return bool(self.row) and self.row[sensor] > _LONG and float(self.by_chance[sensor]) > _OFTEN
 
     def repair(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
-        """Where a sensor hangs for long, noise as simulated takes the place of what it puts out."""
+        """Where a sensor hangs for long, noise as simulated takes the place of what it puts out.
+
+        Single samples are predicted from their neighbours.
+        """
+        if self._single:
+            return comparison.with_recording(predicted(comparison.observed, self._held(comparison), generator))
         if max(self.row, default=0.0) <= _LONG:
             return self.apply_to_reference(comparison, generator)
         filled = comparison.recording.clone()
@@ -179,7 +244,7 @@ class StuckSamples(Mechanism):
         # A simulation without any repeats does not say that they are impossible.
         chance = self.by_chance.clamp(min=0.5 / comparison.reference.signal[:, 0].numel())
         enter, leave = self._turns()
-        same = repeats(comparison).same
+        same = self._held(comparison)
         held = torch.zeros(same.shape, dtype=torch.float64)
         for i in self.probability.nonzero()[:, 0].tolist():
             seen = _longest_by_chance(len(same[i]), float(chance[i])) if self._hangs_beside_chance(i) else 1.0
