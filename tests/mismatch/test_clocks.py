@@ -132,6 +132,18 @@ def test_what_all_lose_at_once_is_told_by_the_simulation_s_tone(losses):
     assert line_test(after).p_value > LEVEL
 
 
+def test_many_losses_of_all_sensors_are_one_finding():
+    """More than are found at once, and more at a time: what is left once some are made room for is added to them."""
+    losses = {2000: 7, 5000: 12, 8000: 31, 11000: 5, 14000: 9}
+    case = comparison(generator(62), lost(losses, 0, 1, 2, 3), 2.0)
+    found = ClockSkew.detect_and_fit(case, LEVEL)
+    assert len(found.effect.losses) == len(losses)
+    assert all(abs(at - true) < 20 for (at, _), true in zip(found.effect.losses, losses, strict=True))
+    after = found.repair(case, generator(1))
+    assert clock_test(after).p_value > LEVEL
+    assert line_test(after).p_value > LEVEL
+
+
 def test_a_slow_tone_tells_as_well(monkeypatch):
     """Of hardly more than a cycle in a block."""
     monkeypatch.setattr(sys.modules[__name__], "TONE", 1.1 * BLOCKS / N)

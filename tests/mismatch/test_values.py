@@ -255,6 +255,26 @@ def test_a_value_in_the_place_of_samples_is_told(value: float) -> None:
     assert 0.5 < float((again == value).double().mean() / (recording == value).double().mean()) < 2
 
 
+@pytest.mark.parametrize("value", [0.0, 5.0])
+def test_single_samples_in_whose_place_a_value_stands_are_told(value: float) -> None:
+    """A read that failed now and then gives zero, which may lie far out in a sensor's own values."""
+    recording, simulation, g = drawn(24)
+    failed = even(N, g=g) < 0.01
+    recording[1, failed] = value
+    comparison = Comparison.of(SCENE, recording, simulation)
+    found = nominated(comparison, StuckSamples)
+    assert found.sensors == (1,)
+    assert found.sentence.startswith(f"single samples are {value:.6g} deg/s, which stands in their place in sensor y")
+    assert found.parameters["probability[1]"].value == pytest.approx(float(failed.double().mean()), rel=0.02)
+    assert Clipping.detect_and_fit(comparison, LEVEL) is None
+    again = found.effect.apply(simulation[0], SCENE, g)
+    assert float((again[1] == value).double().mean()) == pytest.approx(0.01, rel=0.3)
+    assert bool((again[[0, 2]] == simulation[0, [0, 2]]).all())
+    repaired = found.repair(comparison, g)
+    assert marginals.values_test(repaired).p_value > 0.01
+    assert float(repaired.recording[1, failed].std() / recording[1, ~failed].std()) == pytest.approx(1.0, abs=0.2)
+
+
 def test_a_stretch_that_was_logged_twice_has_no_limits() -> None:
     recording, simulation, _ = drawn(23)
     recording[:, 3000:4000] = recording[:, 1000:2000]

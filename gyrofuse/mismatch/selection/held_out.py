@@ -10,7 +10,6 @@ from torch import Tensor
 
 from gyrofuse.mismatch.likelihoods.spectra.slow_ordinates import slow_gains
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
-from gyrofuse.mismatch.mechanisms.spectra.spectral import Spectral
 from gyrofuse.mismatch.selection.classifier import distinguishability
 from gyrofuse.mismatch.selection.discrepancy import differences_of_fold, discrepancy_of_fold, paired_discrepancy
 from gyrofuse.mismatch.selection.shares import Share, shares_of
@@ -137,8 +136,7 @@ def share_of_record(score: HeldOutScore, comparison: Comparison) -> float:
     """
     gained = score.blocks.clone()
     for fold, one in enumerate(score.by_fold):
-        if isinstance(one, Spectral):
-            gained[in_fold(N_JUDGED, fold)] -= slow_gains(comparison, one.spectra, fold)
+        gained[in_fold(N_JUDGED, fold)] -= slow_gains(comparison, one.spectra, fold)
     if float(gained.sum()) < score.total / 2:
         return 1.0
     gained = gained.clamp(min=0)

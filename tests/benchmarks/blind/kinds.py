@@ -66,6 +66,7 @@ _MECHANISMS: dict[str, Callable[[Bench, float], Part]] = {
     "clock_lost_samples": _with(shapes.clock_skew, lost=True),
     "time_scale": shapes.time_scale,
     "parameter_shift": spectral.parameter_shift,
+    "sensor_gain": spectral.sensor_gain,
 }
 
 _NULLS: dict[str, dict[str, Any]] = {

@@ -393,12 +393,14 @@ def notch(bench: Bench, nats: float) -> Part:
 
 
 def parameter_shift(bench: Bench, nats: float, *, only: str | None = None) -> Part:
-    """The same physics with other numbers; `only` one of "white", "ar1", "walk"."""
-    sensors = bench.some_sensors(2)
+    """The same physics with other numbers; `only` one of "white", "ar1", "walk", or "gain": all of one sensor alike."""
+    sensors = bench.some_sensors(1, 1) if only == "gain" else bench.some_sensors(2)
     chosen = np.isin(np.arange(bench.n_sensors), sensors)
     names = ["white", "ar1", "walk"]
     weights = bench.rng.uniform(0.3, 1, 3) * bench.rng.choice([-1, 1], 3)
-    if only:
+    if only == "gain":
+        weights = np.full(3, bench.rng.choice([-1.0, 1.0]))
+    elif only:
         weights = np.array([float(name == only) for name in names]) * (-1 if only == "white" else 1)
 
     def shifted(size: float) -> tuple[Array, Array, Array]:
@@ -425,3 +427,11 @@ def parameter_shift(bench: Bench, nats: float, *, only: str | None = None) -> Pa
     size = solve(nats, lambda size: base(size).nats, 1e-5, 14.0)
     within("white noise that is less by a factor", math.exp(-size * weights[0]), MOST_QUIETER, "")
     return base(size)
+
+
+def sensor_gain(bench: Bench, nats: float) -> Part:
+    """One factor on all that a sensor gives; other numbers of all its processes, by that factor, are the same."""
+    part = parameter_shift(bench, nats, only="gain")
+    factor = math.sqrt(part.parameters["white_factor"]["value"])
+    gain = quantity(factor, "", np.array([factor]))
+    return replace(part, mechanism="sensor_gain", look_alikes=("parameter_shift",), parameters={"gain": gain})

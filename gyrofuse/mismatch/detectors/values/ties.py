@@ -126,10 +126,11 @@ def recurring(sensor: int, values: Tensor, value: float | None = None) -> Recurr
 def stands_alone(others: Tensor, value: float, times: int) -> bool:
     """Whether a value at the end of all others `(time,)` occurs more often than any that was cut there would.
 
-    Tails fall: half a standard deviation before an end stop there are more values than beyond it.
+    Tails fall: half a standard deviation before an end stop, and at the next value on a lattice, there are more values
+    than beyond it.
     """
-    near = float((others - value).abs().le(others.std() / 2).sum())
-    return near < times / 4
+    distance = (others - value).abs()
+    return float((distance <= max(float(others.std()) / 2, 1.5 * float(distance.min()))).sum()) < times / 4
 
 
 def missing_recurrences(comparison: Comparison) -> dict[int, tuple[Recurring, float]]:
@@ -173,6 +174,8 @@ def band_of(found: Recurring, values: Tensor, sd: float) -> Band | None:
         values: Samples, `(time,)`.
         sd: Standard deviation of the simulation's values.
     """
+    if not math.isfinite(found.above - found.below):  # a band has values on either side
+        return None
     # What is put out in a wide band has nearly all of the values, and their scatter is not that of what it took.
     if _leaves_gap(found, found.spread) or (sd > 0 and _leaves_gap(found, sd)):
         return Band(*_limits(found), float(values.mean()), False)

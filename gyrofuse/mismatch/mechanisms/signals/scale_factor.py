@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
+
+from torch import Tensor
 
 from gyrofuse.mismatch.detectors.slow.channels import rates
 from gyrofuse.mismatch.mechanisms.signals.channel_gain import ChannelGain
@@ -14,7 +17,8 @@ from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 class ScaleFactor(ChannelGain):
     """`x_i(t) = error_i omega(t)` beside what the simulation has of the rate `omega`, an auxiliary channel.
 
-    Seen only while the rate changes: at a constant rate it is a bias.
+    Seen only while the rate changes: at a constant rate it is a bias. Where it differs for either sign the output
+    follows the modulus of the rate as well.
     """
 
     name: ClassVar[str] = "scale_factor"
@@ -25,6 +29,10 @@ class ScaleFactor(ChannelGain):
     @classmethod
     def channels(cls, comparison: Comparison) -> list[str]:
         return rates(comparison)
+
+    @classmethod
+    def rows(cls, values: Tensor) -> Mapping[str, Tensor]:
+        return {"each": values, "modulus": values.abs()}
 
     @classmethod
     def words(cls, gain: float, channel: str, where: str, unit: str) -> str:
