@@ -80,8 +80,9 @@ def found(kind: str, seed: int) -> BoardReport:
     return diagnose_board(*scene(kind, seed))
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_one_cause_is_one_finding(kind: str):
+def test_one_cause_is_one_finding():
+    """Of one kind; of all kinds below."""
+    kind = KINDS[0]
     report = found(kind, 1)
     assert [cause.mechanism for cause in report.causes] == [kind]
     assert report.causes[0].sensors == {"rate": tuple(range(6)), "acceleration": tuple(range(6))}

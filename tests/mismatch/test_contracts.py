@@ -56,7 +56,7 @@ SHORT = 2048  # samples, where a mechanism acts and is not looked for
 SHORTEST = 4096  # samples that are diagnosed
 MANY = 100  # records, whose mean spectra are known to a few per cent in each band
 # Draws of each mechanism that it is looked for in by itself, by a diagnosis, and nulls; by default, and with `--full`.
-DRAWN, DIAGNOSED, NULLS = (5, 100), (2, 20), (30, 200)
+DRAWN, DIAGNOSED, NULLS = (4, 100), (1, 20), (30, 200)
 # Sensors of the array, those concerned, and the size of the effect over one that is plainly seen.
 VARIANTS = {
     "all sensors": (3, (0, 1, 2), 1.0),

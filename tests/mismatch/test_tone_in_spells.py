@@ -11,6 +11,7 @@ from torch import Tensor
 
 import gyrofuse as gf
 from gyrofuse.mismatch.mechanisms.regimes.tone_in_spells import ToneInSpells
+from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 
 N, RATE, F = 16384, 200.0, 26.0
@@ -84,3 +85,14 @@ def test_a_repaired_simulation_is_on_as_long_at_other_times():
     expected = sum(stop - start for start, stop in SPELLS) / (N / RATE)
     assert float(share.mean()) == pytest.approx(expected, abs=0.03)
     assert float(share.mean(0).std()) < 0.25  # at other times in each record
+
+
+@pytest.mark.statistical
+def test_a_tone_that_swells_and_fades_is_three():
+    """An amplitude that swings has a line on either side, which together come and go as spells do."""
+    swelling = (1 + 0.7 * torch.sin(2 * math.pi * 5 / N * RATE * T)) * torch.sin(2 * math.pi * F * T)
+    report = found_in(0.6 * GAINS * swelling, 4)
+    assert [finding.mechanism for finding in report.findings] == ["vibration_tone"] * 3
+    assert all(isinstance(finding.effect, VibrationTone) for finding in report.findings)
+    found = sorted(finding.frequency_hz for finding in report.findings)
+    assert found == pytest.approx([F - 5 / N * RATE, F, F + 5 / N * RATE], abs=1e-3)

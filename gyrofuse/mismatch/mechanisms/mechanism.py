@@ -263,8 +263,8 @@ class Alternative(NamedTuple):
     sd: float
 
     def beats(self, gain: float) -> bool:
-        """Whether it scores higher than the finding's `gain`, by more than chance."""
-        return self.gain > gain + _BETTER_SD * self.sd
+        """Whether it scores higher than the finding's `gain`, by more than chance, and than forms are true, a 1000th."""
+        return self.gain > gain + max(_BETTER_SD * self.sd, abs(gain) / 1000)
 
 
 class Context(NamedTuple):

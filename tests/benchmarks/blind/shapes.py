@@ -113,6 +113,7 @@ def ring_down(bench: Bench, nats: float) -> Part:
     return replace(
         _at_unknown_times(bench, "ring_down", nats, unit, unknown),
         frequency_hz=f,
+        look_alikes=("pulses",) if f * decay < 1 else (),  # what is gone within a cycle is a pulse that overshoots
         parameters={"frequency": quantity(f, "Hz"), "decay_time": quantity(decay, "s")},
     )
 

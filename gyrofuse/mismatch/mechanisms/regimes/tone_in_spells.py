@@ -86,6 +86,8 @@ class ToneInSpells(Transient):
             return None
         if not _steady(comparison, effect, spells, seen, noise):
             return None
+        if spells[1:] and _of_steady_tones(comparison, seen, noise / ~outside) > gain:  # whose beats come and go
+            return None
         longest = int((snr.square() * ~outside).sum(-1).argmax())
         per_sample = float((effect.amplitude[longest].square() / (4 * noise)).sum())  # nats that tell an end of a spell
         reach = Z * max(1.0, 3 / per_sample) / info.rate
@@ -319,6 +321,29 @@ def _powers_of_parts(comparison: Comparison, padding: int) -> Tensor:
     taper = torch.hann_window(length, dtype=torch.float64)
     transform = torch.fft.rfft((blocks - blocks.mean(-1, keepdim=True)) * (taper / taper.norm()), n=padding * length)
     return squared_modulus(transform)
+
+
+def _of_steady_tones(comparison: Comparison, frequency: float, noise: Tensor) -> float:
+    """Nats of three tones near to one another that are there all the time, the strongest first.
+
+    Args:
+        comparison: Recording and simulation.
+        frequency: Near which they are, cycles per sample.
+        noise: Density of the noise near it, per sample `(sensor,)`; infinite in sensors that do not count.
+    """
+    n, reach, padding, gained = comparison.n_samples, 64, 4, 0.0  # reach: bins to either side
+    turned = _turned(comparison, frequency)
+    t = torch.arange(n, dtype=torch.float64) / (padding * n)
+    for _ in range(3):
+        transform = torch.fft.fft(turned, n=padding * n)
+        near = torch.cat([transform[:, : reach * padding], transform[:, -reach * padding :]], -1)
+        gains = (near.abs().square() / (n * noise[:, None])).sum(0)
+        best = int(gains.argmax())
+        gained += float(gains[best])
+        bin_ = best if best < reach * padding else best - 2 * reach * padding
+        tone = torch.polar(torch.ones_like(t), 2 * math.pi * bin_ * t)
+        turned = turned - near[:, best, None] / n * tone
+    return gained
 
 
 def _turned(comparison: Comparison, frequency: float) -> Tensor:
