@@ -263,7 +263,7 @@ class Alternative(NamedTuple):
     sd: float
 
     def beats(self, gain: float) -> bool:
-        """Whether it scores higher than the finding's `gain`, by more than chance, and than forms are true, a 1000th."""
+        """Whether it scores higher than the finding's `gain`: beyond chance, and a 1000th to which forms are true."""
         return self.gain > gain + max(_BETTER_SD * self.sd, abs(gain) / 1000)
 
 

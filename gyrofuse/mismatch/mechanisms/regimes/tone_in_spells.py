@@ -62,7 +62,9 @@ class ToneInSpells(Transient):
         p_value = min(line.p_value, peak.p_value)
         if p_value > level:
             return None
-        seen = _seen_in_parts(comparison, line.frequency if line.p_value <= peak.p_value else peak.frequency)
+        # The middle of a peak may be bins away from where a tone that is on for long is surely seen.
+        inside = line.p_value <= peak.p_value or abs(line.frequency - peak.frequency) < peak.width
+        seen = _seen_in_parts(comparison, line.frequency if inside else peak.frequency)
         noise = _noise_near(comparison, seen)
         spells = _spells(comparison, seen, noise)
         if not spells:
