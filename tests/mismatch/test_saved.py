@@ -93,6 +93,7 @@ EVERY = (
     Clipping(numbers(-0.7, -math.inf), numbers(math.inf, 1 / 3), numbers(0.1, 0.2)),
     StuckSamples(numbers(0.2, 0.1), numbers(0.01, 0.0), True),
     StuckSamples(numbers(0.2, 0.0), numbers(0.01, 0.0), False, (7.3, 1.0), (1 / 3, 0.0)),
+    StuckSamples(numbers(0.2, 0.0), numbers(0.01, 0.0), False, (), (1 / 3, 0.0)),  # of single samples
     ScaleMixture(numbers(0.2, 0.0), numbers(3.0, 1.0)),
     Spikes(numbers(0.05, 0.0), numbers(7 / 3, 0.0), numbers(0.3, 0.0), True),
     ClockSkew((1,), 1e-5 / 3, ((200, 2), (300, 1)), 0.07, complex_numbers(0.3j), complex_numbers(0.1)),

@@ -182,7 +182,11 @@ class StuckSamples(Mechanism):
         return self._estimated(comparison, tuple(self.probability.nonzero()[:, 0].tolist()), keep)
 
     def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
-        again = self._held(comparison)[sensor].nonzero()[:, 0]
+        if self._single:
+            spread = float(comparison.recording[sensor].std())
+            pictures.values(ax, comparison, sensor, self.filler[sensor], spread)
+            return
+        again = repeats(comparison).same[sensor].nonzero()[:, 0]
         first = int(again[0]) - 20 if len(again) else 0
         pictures.samples(ax, comparison, sensor, first, 60)
 
