@@ -116,8 +116,12 @@ def mixing_of(spectra: Tensor, dof: Tensor, coherence: Tensor, free: Tensor | No
     return Mixing(matrix, chosen, sd, seen.log_likelihood(matrix) - seen.log_likelihood(torch.zeros_like(matrix)))
 
 
-def of_known_powers(found: Mixing, spectra: Tensor, dof: Tensor, coherence: Tensor, unmixed: Tensor) -> Mixing:
+def of_known_powers(
+    found: Mixing, spectra: Tensor, dof: Tensor, coherence: Tensor, unmixed: Tensor, *, fewer: bool = True
+) -> Mixing:
     """The mixing that the powers of a simulation prefer among those that coherences leave open; else the same.
+
+    Nor is it looked for where as many sensors share something as a source in common makes of them.
 
     Args:
         found: The one that coherences alone prefer.
@@ -125,21 +129,21 @@ def of_known_powers(found: Mixing, spectra: Tensor, dof: Tensor, coherence: Tens
         dof: Complex ordinates of each, `(band,)`.
         coherence: What the simulation's sensors share, `(band, sensor, sensor)`.
         unmixed: Cross-spectra of the simulation, `(band, sensor, sensor)`.
+        fewer: Whether pairs that gain less than their numbers cost are left out.
     """
-    if not bool(found.free.any()):
+    most, by_chance = 60, 1.0  # entries, and standard deviations
+    if not 0 < int(found.free.sum()) <= most:
         return found
     free, seen = found.free, _Seen(spectra, dof, coherence)
     matrix, sd, value = _scored(spectra, dof, unmixed, free)
-    while int(free.sum()) > 2:
+    while fewer and int(free.sum()) > 2:
         # Either of two may stand for the other: pairs have nothing where both together have nothing.
         size = torch.where(free, (matrix + matrix.mT).abs() / (sd.square() + sd.mT.square()).sqrt(), math.inf)
-        i, j = divmod(int(size.argmin()), len(free))
-        fewer = free.clone()
-        fewer[i, j] = fewer[j, i] = False
-        without = _scored(spectra, dof, unmixed, fewer)
-        if value - without[2] > NATS_PER_NUMBER * int((free & ~fewer).sum()):
+        gone = (size <= max(by_chance, float(size.min()))) & (size < size[free].max())
+        without = _scored(spectra, dof, unmixed, free & ~gone) if bool(gone.any()) else None
+        if without is None or value - without[2] > NATS_PER_NUMBER * int((free & gone).sum()):
             break
-        free, (matrix, sd, value) = fewer, without
+        free, (matrix, sd, value) = free & ~gone, without
     gain = seen.log_likelihood(matrix) - seen.log_likelihood(torch.zeros_like(matrix))
     known = Mixing(matrix, free, sd, gain)
     return known if known.worth > found.worth - NATS_PER_NUMBER * int(found.free.sum()) else found

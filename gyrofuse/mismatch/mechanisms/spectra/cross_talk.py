@@ -202,4 +202,4 @@ def _mixing(comparison: Comparison, blocks: Tensor, free: Tensor | None = None) 
     size = power.mT.sqrt()
     unmixed = shared * (size[:, :, None] * size[:, None, :])
     seen = matrices[known], dof[known], shared[known]
-    return of_known_powers(mixing_of(*seen, free), *seen, unmixed[known])
+    return of_known_powers(mixing_of(*seen, free), *seen, unmixed[known], fewer=free is None)
