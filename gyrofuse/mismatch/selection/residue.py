@@ -28,10 +28,8 @@ def is_left_of_form(effect: Mechanism, start: Comparison, comparison: Comparison
         taken = comparison.taken_off[None]
         taken = taken - taken.mean(-1, keepdim=True)
         explained = cross_spectra(taken, comparison.bands)[0].diagonal(dim1=-2, dim2=-1).real.mT.nan_to_num() / noise
-    # What a filter adds leaves a part of itself behind; of what it has taken so much less, as stop bands are as deep as
-    # their form.
-    more = (noise - start.reference.power).nan_to_num() / noise
-    explained = torch.maximum(explained, torch.maximum(more, -part * more))
+    # What a filter takes away leaves a part of itself behind, and not of what it has taken.
+    explained = torch.maximum(explained, (noise - start.reference.power).nan_to_num().clamp(min=0) / noise)
     before = reference.spectra
     changed = effect.spectra(before, comparison.bands.frequency).diagonal(dim1=-2, dim2=-1).real.mT / noise - 1
     weight = reference.dof * changed.square()
