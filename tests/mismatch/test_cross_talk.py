@@ -78,6 +78,16 @@ def test_powers_that_are_others_tell_nothing_of_a_mixing():
     assert torch.allclose(found.matrix, mixing, atol=0.01)
 
 
+def test_a_band_in_which_a_simulation_has_nothing_tells_no_mixing():
+    shapes = torch.ones(40, 3, dtype=torch.float64)
+    mixing = torch.tensor([[0, 0.2, 0], [0.2, 0, 0], [0, 0, 0]], dtype=torch.float64)
+    dof, eye = torch.full((40,), 1e4, dtype=torch.float64), torch.eye(3, dtype=torch.complex128).repeat(40, 1, 1)
+    seen = spectra_of(mixing, shapes), dof, eye
+    found, nothing = mixing_of(*seen), torch.diag_embed(shapes).to(torch.complex128)
+    nothing[3] = 0.0
+    assert of_known_powers(found, *seen, nothing) is found
+
+
 @pytest.mark.statistical
 def test_pairs_that_share_a_source_each_are_two_sources():
     """Two supplies: the strongest direction of both is of neither, and no cross-talk either."""

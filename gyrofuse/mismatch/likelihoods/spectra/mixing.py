@@ -136,6 +136,8 @@ def of_known_powers(
         return found
     free, seen = found.free, _Seen(spectra, dof, coherence)
     matrix, sd, value = _scored(spectra, dof, unmixed, free)
+    if not math.isfinite(value):  # a band in which a simulation has next to nothing
+        return found
     while fewer and int(free.sum()) > 2:
         # Either of two may stand for the other: pairs have nothing where both together have nothing.
         size = torch.where(free, (matrix + matrix.mT).abs() / (sd.square() + sd.mT.square()).sqrt(), math.inf)
@@ -161,12 +163,15 @@ def _scored(spectra: Tensor, dof: Tensor, unmixed: Tensor, free: Tensor) -> tupl
     def log_posterior(matrix: Tensor) -> float:
         mixed = (eye + matrix).to(unmixed.dtype)
         whole = mixed @ unmixed @ mixed.mT
-        surprise = torch.linalg.solve(whole, spectra).diagonal(dim1=-2, dim2=-1).real.sum(-1)
+        solved, failed = torch.linalg.solve_ex(whole, spectra)
+        if bool(failed.any()):  # no mixing makes of independent signals fewer
+            return -math.inf
+        surprise = solved.diagonal(dim1=-2, dim2=-1).real.sum(-1)
         fit = (dof * (torch.linalg.slogdet(whole).logabsdet + surprise)).sum()
         return -float(fit + (matrix / wide).square().sum() / 2)
 
-    value = log_posterior(matrix)
-    for _ in range(rounds):
+    value, sd = log_posterior(matrix), torch.zeros_like(matrix)
+    for _ in range(rounds if math.isfinite(value) else 0):
         mixed = (eye + matrix).to(unmixed.dtype)
         half = unmixed @ mixed.mT  # Y M^T
         inverse = torch.linalg.inv(mixed @ half)
@@ -184,14 +189,16 @@ def _scored(spectra: Tensor, dof: Tensor, unmixed: Tensor, free: Tensor) -> tupl
         while True:
             new = matrix.clone()
             new[free] += shorter * step
-            if (made := log_posterior(new)) >= value or shorter < least:
+            made = log_posterior(new)
+            if made >= value or shorter < least:
                 break
             shorter /= 2
+        sd[free] = torch.linalg.inv(information).diagonal().sqrt()
+        if not made >= value:
+            break
         moved, matrix, value = float((new - matrix).abs().max()), new, made
         if moved < least:
             break
-    sd = torch.zeros_like(matrix)
-    sd[free] = torch.linalg.inv(information).diagonal().sqrt()
     return matrix, sd, value
 
 
