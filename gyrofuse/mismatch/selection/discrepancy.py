@@ -100,12 +100,16 @@ def leads_away(start: Comparison, comparison: Comparison, by_fold: tuple[Mechani
     repaired = (_without_lines(effect.repair(comparison, g)) for effect in by_fold)
     after = sum(discrepancy_of_fold(one, fold) for fold, one in enumerate(repaired)) / N_FOLDS
     before = min(mean_discrepancy(_without_lines(start)), mean_discrepancy(_without_lines(comparison)))
-    return after > _FARTHER * max(before, 1.0)
+    return _is_farther(after, before)
 
 
 def is_farther(made: Comparison, before: Comparison) -> bool:
     """Whether a simulation is farther from the recording than before, with its lines."""
-    return mean_discrepancy(made) > _FARTHER * max(mean_discrepancy(before), 1.0)
+    return _is_farther(mean_discrepancy(made), mean_discrepancy(before))
+
+
+def _is_farther(after: float, before: float) -> bool:
+    return after > _FARTHER * max(before, 1.0)
 
 
 def discrepancy_left(comparison: Comparison, after: float) -> TestResult | None:

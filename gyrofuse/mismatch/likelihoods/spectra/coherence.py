@@ -17,6 +17,15 @@ def coherence_of(matrices: Tensor) -> Tensor:
     return matrices * (size[:, :, None] * size[:, None, :])
 
 
+def connected(linked: Tensor) -> Tensor:
+    """Which sensors hang together, directly or by others, of those that are linked `(sensor, sensor)`, likewise."""
+    p = len(linked)
+    reached = linked | linked.mT | torch.eye(p, dtype=torch.bool)
+    for _ in range(p.bit_length()):  # twice as far each time
+        reached = reached.to(torch.float64) @ reached.to(torch.float64) > 0
+    return reached
+
+
 def smooth_coherence(coherence: Tensor, dof: Tensor) -> Tensor:
     """Coherence in each band from as many neighbouring ones as an inverse takes, `(band, sensor, sensor)`.
 

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.likelihoods.declared import declared
+from gyrofuse.mismatch.likelihoods.spectra.coherence import connected
 from gyrofuse.mismatch.likelihoods.spectra.common_sources import Common, CommonBump
 from gyrofuse.mismatch.likelihoods.spectra.components import Peak, Term, oscillation
 from gyrofuse.mismatch.likelihoods.spectra.fit import Pieces, data_model, pieces, powers
@@ -146,10 +147,7 @@ def _groups(data: Ratios, excess: Tensor) -> list[Tensor]:
     dof = data.pair_dof[:, None, None]
     bands = (data.pair_dof > 0).sum().clamp(min=1)
     z = ((dof * squared).sum(0) - bands) / bands.sqrt()  # squared coherences of ordinates of chance are exponential
-    linked = (z > surely) | torch.eye(p, dtype=torch.bool)
-    for _ in range(p.bit_length()):
-        linked = linked.to(torch.float64) @ linked.to(torch.float64) > 0
-    groups = {tuple(row.tolist()) for row in linked if 1 < int(row.sum()) < p}
+    groups = {tuple(row.tolist()) for row in connected(z > surely) if 1 < int(row.sum()) < p}
     return [torch.tensor(group) for group in sorted(groups, reverse=True)]
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from gyrofuse.mismatch.decisions import NATS_AS_GOOD, NEW_TERM_NATS
 from gyrofuse.mismatch.detectors.spectra.pooled_coherence import common_source
 from gyrofuse.mismatch.likelihoods.declared import declared
-from gyrofuse.mismatch.likelihoods.spectra.coherence import coherence_of, smooth_coherence
+from gyrofuse.mismatch.likelihoods.spectra.coherence import coherence_of, connected, smooth_coherence
 from gyrofuse.mismatch.likelihoods.spectra.data import block_spectra, reference_noise
 from gyrofuse.mismatch.likelihoods.spectra.mixing import Mixing, mixing_of, of_known_powers
 from gyrofuse.mismatch.mechanisms import pictures
@@ -137,7 +137,7 @@ def _source_instead(comparison: Comparison, mixing: CrossTalk) -> _SourceInstead
     if source is None:
         return None
     # Elsewhere something else may mix sensors, or be a source: one name competes with one.
-    same = _linked(mixing.mixing, best.term.free.any(0))
+    same = connected(mixing.mixing != 0)[best.term.free.any(0)].any(0)
     beside = replace(mixing, mixing=mixing.mixing * same)
     own, other = (_held_out(one, comparison) for one in (beside, replace(source, company=best.company)))
     more, chance = float((own - other).sum()), max(2 * sd_of_sum(own - other), NATS_AS_GOOD)
@@ -146,12 +146,6 @@ def _source_instead(comparison: Comparison, mixing: CrossTalk) -> _SourceInstead
     if more > chance:
         return _SourceInstead(least=best.gain + 1)
     return _SourceInstead((source.name,), most=best.gain - 1)
-
-
-def _linked(mixing: Tensor, sensors: Tensor) -> Tensor:
-    """Sensors, of some and those that these are mixed with, directly or by others, `(sensor,)`."""
-    linked = ((mixing != 0) | (mixing.mT != 0)).to(torch.float64) + torch.eye(len(mixing), dtype=torch.float64)
-    return torch.linalg.matrix_power(linked, len(mixing)) @ sensors.to(torch.float64) > 0
 
 
 def _held_out(effect: Spectral, comparison: Comparison) -> Tensor:

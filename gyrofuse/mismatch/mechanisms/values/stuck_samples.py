@@ -110,10 +110,10 @@ class StuckSamples(Mechanism):
         sensors, filler, chance = tuple(sorted(found)), [0.0] * p, torch.zeros(p, dtype=torch.float64)
         for i, (value, _) in found.items():
             filler[i], chance[i] = value.value, value.expected / n
-        nothing = torch.zeros(p, dtype=torch.float64)
-        nothing[list(sensors)] = 1.0
+        concerned = torch.zeros(p, dtype=torch.float64)
+        concerned[list(sensors)] = 1.0
         whole = torch.ones(n, dtype=torch.bool)
-        effect = cls(nothing, chance, False, (), tuple(filler))._with_share(comparison, whole)
+        effect = cls(concerned, chance, False, (), tuple(filler))._with_share(comparison, whole)
         parameters = {}
         for i in sensors:
             share = float(effect.probability[i])
@@ -139,8 +139,7 @@ class StuckSamples(Mechanism):
         held = self._held(comparison)[:, keep]
         share = torch.where(self.probability > 0, held.to(torch.float64).mean(-1), 0.0)
         at = self.probability.nonzero()[:, 0].tolist()
-        jointly = float(held[at].all(0).to(torch.float64).mean() - share[at].prod())
-        return replace(self, probability=share, together=len(at) > 1 and jointly > _TOGETHER * float(share[at].min()))
+        return replace(self, probability=share, together=_at_once(held[at], share[at]))
 
     @property
     def _single(self) -> bool:
@@ -163,8 +162,7 @@ class StuckSamples(Mechanism):
         concerned[list(sensors)] = True
         probability = torch.where(concerned, ((share - chance) / (1 - chance)).clamp(min=0), 0.0)
         at = list(sensors)
-        jointly = float(same[at].all(0).to(torch.float64).mean() - share[at].prod())
-        together = len(at) > 1 and jointly > _TOGETHER * float(probability[at].min())
+        together = _at_once(same[at], probability[at])
         length = [
             _mean_row(row, float(c), float(p)) if p > 0 else 1.0
             for row, c, p in zip(every, chance, probability, strict=True)
@@ -263,6 +261,12 @@ class StuckSamples(Mechanism):
 def run_lengths(true: Tensor) -> Tensor:
     """Lengths of the runs of true entries of `(time,)`, `(run,)`."""
     return runs_of(true).diff()[:, 0].to(torch.float64)
+
+
+def _at_once(held: Tensor, probability: Tensor) -> bool:
+    """Whether several sensors `(sensor, time)` put out none of their own at the same time, beyond chance."""
+    jointly = float(held.all(0).to(torch.float64).mean() - held.to(torch.float64).mean(-1).prod())
+    return len(held) > 1 and jointly > _TOGETHER * float(probability.min())
 
 
 def _filler(values: Tensor, same: Tensor, long: float) -> float | None:
