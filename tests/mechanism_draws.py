@@ -359,7 +359,7 @@ def _(setting: Setting) -> Drawn:
     seconds = setting.n_samples / RATE
     size, onset, tau = setting.signed(5.0, 7.0) * setting.size, setting.even(0.2, 0.6) * seconds, seconds / 16
     return Drawn(
-        LateWarmUp(size, _none(setting), onset, tau),
+        LateWarmUp(size, _none(setting), onset, tau, decays=setting.chance()),
         {"onset": onset, "time_constant": tau, **setting.of_each("size", size)},
     )
 

@@ -84,6 +84,12 @@ def thermostat(seed: int) -> np.ndarray:
     return x
 
 
+def started_anew(seed: int) -> np.ndarray:
+    x = noise(seed)
+    x[1] += np.where(T >= 31.234, 0.5 * np.exp(-(T - 31.234).clip(0) / 7), 0.0)
+    return x
+
+
 def shocks(seed: int) -> np.ndarray:
     x = noise(seed)
     for onset, sign in ((3000, 1), (9000, -1), (12_345, 1)):
@@ -133,6 +139,11 @@ CASES = {
     "angle counts": Case(angle_counts, ("quantization_noise",), {"quantization_noise.angle[0]": 0.5 / RATE}),
     "thermostat": Case(
         thermostat, ("bias_oscillation",), {"bias_oscillation.period": 13.0, "bias_oscillation.amplitude[2]": 0.12}
+    ),
+    "started anew": Case(
+        started_anew,
+        ("warm_up_transient",),
+        {"warm_up_transient.onset": 31.234, "warm_up_transient.time_constant": 7.0, "warm_up_transient.size[1]": 0.5},
     ),
     "shocks": Case(shocks, ("pulses",), {"pulses.width": 20 / RATE}),
     "glitches of three": Case(glitches_of_three, ("pulses",), {}),

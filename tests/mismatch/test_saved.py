@@ -152,6 +152,7 @@ EVERY = (
         numbers(1 / 3, 0.0), torch.zeros(2, 4, dtype=torch.float64), 0.7, "temperature", 0, (), (numbers(0.1, 0.2),)
     ),
     LateWarmUp(numbers(1 / 3, 0.0), torch.zeros(2, 4, dtype=torch.float64), 1.7, 2.3),
+    LateWarmUp(numbers(1 / 3, 0.0), torch.zeros(2, 4, dtype=torch.float64), 1.7, 2.3, decays=True),
     WarmUpTransient(
         numbers(1 / 3, 0.0), torch.zeros(2, 4, dtype=torch.float64), 2.3, (Decay(numbers(0.2, 0.0), 20 / 3),)
     ),

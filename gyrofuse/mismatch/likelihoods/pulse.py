@@ -116,8 +116,14 @@ def width_limits(around: Surroundings, found: FittedPulse) -> Limits:
     return float(likely.min()), float(likely.max())
 
 
-def other_course(around: Surroundings, found: FittedPulse) -> float:
-    """Log likelihood ratio of what is no pulse: one sample, a step, louder noise, or what rings."""
+def other_course(around: Surroundings, found: FittedPulse, slow: float) -> float:
+    """Log likelihood ratio of what is no pulse: one sample, a step, louder noise, or what rings or decays slowly.
+
+    Args:
+        around: Samples around the pulse.
+        found: The pulse.
+        slow: Time constant from which a jump that decays is a transient of the bias, samples.
+    """
     which = (found.amplitude != 0).nonzero()[:, 0].tolist()
     pulse = found.pulse
     n = around.samples.shape[-1]
@@ -125,7 +131,31 @@ def other_course(around: Surroundings, found: FittedPulse) -> float:
     steps = torch.stack([(t >= pulse.onset + k * pulse.width / 4).to(torch.float64) for k in range(5)])
     rings, least = around.fitted(DampedTone(round(pulse.onset), 0.5 / pulse.width, pulse.width), which), 0.5  # cycles
     rung = float(rings.log_ratio[which].sum()) if rings.tone.frequency * rings.tone.tau > least else 0.0
-    return max(float(around.each(steps)[:, which].sum(-1).max()), rung, around.of_no_course(which))
+    jumps = float(around.each(steps)[:, which].sum(-1).max())
+    return max(jumps, rung, around.of_no_course(which), _decaying(around, pulse, which, slow))
+
+
+def _decaying(around: Surroundings, pulse: Pulse, which: list[int], shortest: float) -> float:
+    """Log likelihood ratio of a jump near a pulse that decays with a time constant of so many samples or more."""
+    t = torch.arange(around.samples.shape[-1], dtype=torch.float64) + around.first
+
+    def gains(points: Sequence[Sequence[float]]) -> Tensor:
+        onset, tau = torch.tensor(points, dtype=torch.float64).mT[..., None]
+        since = (t - pulse.onset) / pulse.width - onset
+        paths = torch.where(since < 0, 0.0, (-since.clamp(min=0) * pulse.width / tau).exp())
+        return around.each(paths)[:, which].sum(-1)
+
+    constants = [tau for times in (0.35, 0.7, 1.4, 2.8) if (tau := times * pulse.width) >= shortest]
+    starts = [(k / 40, tau) for tau in constants for k in range(-8, 25)]  # onsets in widths
+    if not starts:
+        return 0.0
+    found = optimize.minimize(
+        lambda point: -float(gains([(point[0], max(point[1], shortest))])),
+        starts[int(gains(starts).argmax())],
+        method="Nelder-Mead",
+        options={"maxfev": 60, "fatol": 1e-2, "xatol": 1e-3},
+    )
+    return -float(found.fun)
 
 
 def _gains(around: Surroundings, pulses: Sequence[Pulse]) -> Tensor:

@@ -38,6 +38,7 @@ class Family:
         design_at: Designs at other points; None where only those of the grid exist.
         jumps: Whether templates are jumps at once: several of them, in any order, are another path than one.
         timed: Whether the first nonlinear number is a time after the first sample.
+        decays: Whether what begins then goes back to where it was.
         form: Of a drift with a temperature.
         becomes: Name of the mechanism that its shortest templates are: no look-alike of that.
     """
@@ -51,6 +52,7 @@ class Family:
     design_at: Callable[[Tensor], Tensor] | None = None
     jumps: bool = False
     timed: bool = False
+    decays: bool = False
     form: ThermalForm | None = None
     becomes: str = ""
 

@@ -158,6 +158,11 @@ class Comparison:
         """Samples of one of the 256 blocks for what is slow."""
         return self.n_samples // N_BLOCKS
 
+    @property
+    def shortest_transient(self) -> float:
+        """Time constant from which means over blocks show how a bias settles or decays, samples."""
+        return 2.0 * self.block
+
     def knowing(self, lines: tuple[float, ...]) -> Comparison:
         """Where the simulation has lines at these frequencies, cycles per sample: its noise is what is beside them."""
         if not lines:

@@ -195,12 +195,22 @@ def two_time_constants(bench: Bench, nats: float) -> Part:
 
 def heater(bench: Bench, nats: float) -> Part:
     """Something is switched on while it records, and heats the device."""
+    return _from_a_time_on(bench, nats, lambda since: -np.expm1(-since), "switched on late")
+
+
+def restarted(bench: Bench, nats: float) -> Part:
+    """A part is started anew while it records, or knocked, and its bias decays again."""
+    return _from_a_time_on(bench, nats, lambda since: np.exp(-since), "started anew")
+
+
+def _from_a_time_on(bench: Bench, nats: float, course_of: Callable[[Array], Array], form: str) -> Part:
+    """A course of the time since an onset, in time constants."""
     onset, tau = bench.duration * bench.rng.uniform(0.1, 0.7), bench.duration * bench.rng.uniform(0.03, 0.1)
-    since = np.clip(np.arange(bench.n) / bench.rate - onset, 0, None)
-    course = -np.expm1(-since / tau)
+    since = np.arange(bench.n) / bench.rate - onset
+    course = np.where(since < 0, 0.0, course_of(since.clip(min=0) / tau))
     part, _ = bench.shape("warm_up_transient", nats, bench.gains(bench.some_sensors())[:, None] * course, time_s=onset)
     assert part.signal is not None
-    return replace(part, look_alikes=bench.rivals(part.signal, {"step": shapes.steps(bench)}), form="switched on late")
+    return replace(part, look_alikes=bench.rivals(part.signal, {"step": shapes.steps(bench)}), form=form)
 
 
 def thermal_loop(bench: Bench, nats: float) -> Part:

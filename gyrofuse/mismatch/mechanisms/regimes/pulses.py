@@ -145,6 +145,7 @@ def _pulses(comparison: Comparison) -> list[FittedPulse]:
     """Those that stand out, the strongest of each scan first, each fitted to what the others leave."""
     scan, found, left = pulses_of(comparison), list[FittedPulse](), comparison.recording
     rounds, most, most_doubtful, n = 4, 200, 6, comparison.n_samples
+    slow = comparison.shortest_transient
     shared = torch.corrcoef(comparison.lineless.clamp(-4, 4)).view(comparison.n_sensors, -1)
     for _ in range(rounds):
         doubtful, new, by_chance = list[FittedPulse](), list[FittedPulse](), math.log(scan.n_cells)
@@ -157,11 +158,11 @@ def _pulses(comparison: Comparison) -> list[FittedPulse]:
             numbers = int(one.amplitude.count_nonzero())  # each of which gains half a nat by chance
             if min(float(one.log_ratio.sum()), _jointly(one, shared)) < by_chance + NATS_AS_GOOD + numbers / 2:
                 continue
-            (new if _is_one(around, one) else doubtful).append(one)
+            (new if _is_one(around, one, slow) else doubtful).append(one)
             left = left - _path(one.pulse, one.amplitude, n)
         for one in doubtful:  # beside another one that was not known yet, either seems to be something else
             own = left + _path(one.pulse, one.amplitude, n)
-            if _is_one(_around(comparison, own, one.pulse), one):
+            if _is_one(_around(comparison, own, one.pulse), one, slow):
                 new.append(one)
             else:
                 left = own
@@ -180,10 +181,10 @@ def _jointly(one: FittedPulse, shared: Tensor) -> float:
     return float(z @ torch.linalg.solve(among, z)) / 2
 
 
-def _is_one(around: Surroundings, one: FittedPulse) -> bool:
-    """Whether no other course explains as much."""
+def _is_one(around: Surroundings, one: FittedPulse, slow: float) -> bool:
+    """Whether no other course explains as much, nor a jump that decays over `slow` samples or more."""
     there = sized(around, one.pulse, one.amplitude.nonzero()[:, 0].tolist())
-    return float(there.log_ratio.sum()) > other_course(around, there) + NATS_PER_NUMBER
+    return float(there.log_ratio.sum()) > other_course(around, there, slow) + NATS_PER_NUMBER
 
 
 def _those_alone(comparison: Comparison, found: Sequence[FittedPulse]) -> list[FittedPulse]:

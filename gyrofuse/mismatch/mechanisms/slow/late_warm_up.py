@@ -1,10 +1,11 @@
-"""A warm-up that starts while the device is on: a heater, a radio, a motor nearby that is switched on or off."""
+"""A transient that starts while the device is on: a heater nearby that is switched, a part that is started anew."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import ClassVar
 
 import torch
@@ -22,14 +23,16 @@ from gyrofuse.mismatch.signals.comparison import N_BLOCKS, Comparison, Recording
 
 @dataclass(frozen=True, eq=False)
 class LateWarmUp(SlowEffect):
-    """`x_i(t) = size_i (1 - exp(-(t - t0) / tau))` from `t0` on, in every sensor `i`.
+    """`x_i(t) = size_i (1 - exp(-(t - t0) / tau))` from `t0` on, in every sensor `i`; or `size_i exp(-(t - t0) / tau)`.
 
-    A step that takes its time. What begins before the first sample is a `WarmUpTransient`, what has no end a `Ramp`.
+    A step that takes its time, or one that does not last. What begins before the first sample is a `WarmUpTransient`,
+    what has no end a `Ramp`.
 
     Attributes:
-        size: Where it settles, `(sensor,)`, unit of the signal.
+        size: Where it settles, or how far it jumps, `(sensor,)`, unit of the signal.
         onset_s: `t0`, s after the first sample.
         time_constant_s: `tau`, s.
+        decays: Whether it jumps and decays, as a warm-up of what is started anew.
     """
 
     name: ClassVar[str] = "warm_up_transient"
@@ -38,6 +41,7 @@ class LateWarmUp(SlowEffect):
     happened_once: ClassVar[bool] = True
     onset_s: float
     time_constant_s: float
+    decays: bool = False
 
     @classmethod
     def owns(cls, scan: Scan) -> bool:
@@ -47,19 +51,24 @@ class LateWarmUp(SlowEffect):
     def families(cls, comparison: Comparison) -> Iterable[Family]:
         block, n_constants = comparison.block, 9
         earliest, latest = 4, N_BLOCKS - 16  # blocks: before, it is there from the start, and after it a step
-        onsets = block * torch.arange(earliest, latest, 2, dtype=torch.float64)
-        shortest, longest = 2 * block, comparison.n_samples / 4  # shorter ones are steps, longer ones lines
+        shortest, longest = comparison.shortest_transient, comparison.n_samples / 4  # else they are steps, or lines
         constants = torch.logspace(math.log10(shortest), math.log10(longest), n_constants, dtype=torch.float64)
-        ends = block * torch.arange(N_BLOCKS + 1, dtype=torch.float64)
-
-        def design_at(points: Tensor) -> Tensor:
-            onset, tau = points.mT[..., None]
-            since = (ends - onset).clamp(min=0)
-            # The integral from the onset to the ends of blocks.
-            return ordinates((since + tau * torch.expm1(-since / tau)).diff() / block)[:, None]
-
-        points, words = torch.cartesian_prod(onsets, constants), "the bias moves and settles after some {:.4g} s"
-        return (Family(cls.name, points, design_at(points), words, design_at=design_at, timed=True, becomes="step"),)
+        for decays, apart, words in (
+            (False, 2.0, "the bias moves and settles after some {:.4g} s"),
+            (True, 0.5, "the bias jumps and decays after some {:.4g} s"),  # as fine as steps
+        ):
+            onsets = block * torch.arange(earliest, latest, apart, dtype=torch.float64)
+            points, designs_at = torch.cartesian_prod(onsets, constants), partial(_designs, block, decays)
+            yield Family(
+                cls.name,
+                points,
+                designs_at(points),
+                words,
+                design_at=designs_at,
+                timed=True,
+                decays=decays,
+                becomes="step",
+            )
 
     @classmethod
     def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
@@ -74,12 +83,14 @@ class LateWarmUp(SlowEffect):
         onset, tau = (in_seconds(limits, rate) for limits in found.points)
         effect = replace(cls.of(scan, rate), size=only(found.size[:, 0], scan.sensors))
         onset, tau = onset._replace(value=effect.onset_s), tau._replace(value=effect.time_constant_s)
+        at = f"{onset.value:.4g} s"
+        words = f"jumps at {at} and decays" if effect.decays else f"moves from {at} on and settles"
         return slow_finding(
             comparison,
             strong,
             effect,
             found,
-            f"moves from {onset.value:.4g} s on and settles with a time constant of {tau.value:.3g} s",
+            f"{words} with a time constant of {tau.value:.3g} s",
             {"onset": onset, "time_constant": tau},
             time_s=onset.value,
         )
@@ -89,8 +100,17 @@ class LateWarmUp(SlowEffect):
         """The best of a scan, in its sensors or in others."""
         size = only(scan.fit.size, scan.sensors if which is None else which)
         onset, tau = (number / rate for number in scan.point)
-        return cls(size[:, 0], log_factors(scan), onset, tau)
+        return cls(size[:, 0], log_factors(scan), onset, tau, scan.family.decays)
 
     def paths(self, n_samples: int, info: RecordingInfo) -> Tensor:
-        since = (info.seconds(n_samples) - self.onset_s).clamp(min=0)
-        return -torch.expm1(-since / self.time_constant_s)[None]
+        since = info.seconds(n_samples) - self.onset_s
+        decayed = (-since.clamp(min=0) / self.time_constant_s).exp()
+        return torch.where(since < 0, 0.0, decayed if self.decays else 1 - decayed)[None]
+
+
+def _designs(block: int, decays: bool, points: Tensor) -> Tensor:
+    """Ordinates of the block means from onsets on, with time constants, `(template, number)`, samples."""
+    onset, tau = points.mT[..., None]
+    since = (block * torch.arange(N_BLOCKS + 1, dtype=torch.float64) - onset).clamp(min=0)
+    decayed = -tau * torch.expm1(-since / tau)  # integrals from the onset to the ends of blocks
+    return ordinates((decayed if decays else since - decayed).diff() / block)[:, None]
