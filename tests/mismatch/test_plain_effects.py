@@ -18,6 +18,7 @@ from torch import Tensor
 import gyrofuse as gf
 from gyrofuse.mismatch.detectors.lines.moving_lines import MovingLine, moving_line
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
+from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
 from gyrofuse.mismatch.selection.residue import is_left_of_form
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 
@@ -84,6 +85,15 @@ def thermostat(seed: int) -> np.ndarray:
     return x
 
 
+def switches(seed: int) -> np.ndarray:
+    return noise(seed) + np.array([[0.6], [0.3], [-0.5]]) * signal.square(2 * math.pi * 13.7123 * T)
+
+
+def two_blades(seed: int) -> np.ndarray:
+    parts = ((1, 0.25), (2, 0.7), (3, 0.2), (5, 0.2))
+    return noise(seed) + sum(size * np.cos(2 * math.pi * k * 8.4321 * T + k) for k, size in parts)
+
+
 def started_anew(seed: int) -> np.ndarray:
     x = noise(seed)
     x[1] += np.where(T >= 31.234, 0.5 * np.exp(-(T - 31.234).clip(0) / 7), 0.0)
@@ -140,6 +150,17 @@ CASES = {
     "thermostat": Case(
         thermostat, ("bias_oscillation",), {"bias_oscillation.period": 13.0, "bias_oscillation.amplitude[2]": 0.12}
     ),
+    "switches": Case(
+        switches,
+        ("vibration_tone",),
+        {"vibration_tone.frequency": 13.7123, "vibration_tone.amplitude[0]": 2.4 / math.pi}
+        | {f"vibration_tone.harmonic_{k}[0]": 2.4 / math.pi / k for k in (3, 5)},
+    ),
+    "two blades": Case(
+        two_blades,
+        ("vibration_tone",),
+        {"vibration_tone.frequency": 2 * 8.4321, "vibration_tone.amplitude[1]": 0.7},
+    ),
     "started anew": Case(
         started_anew,
         ("warm_up_transient",),
@@ -164,6 +185,15 @@ def test_it_is_named_and_nothing_else_is(case: Case) -> None:
         entry = said[name]
         middle, half = (entry.low + entry.high) / 2, (entry.high - entry.low) / 2
         assert abs(value - middle) < 1.7 * half, name  # of several limits of 95 %
+
+
+def test_harmonics_are_those_of_the_fundamental_frequency() -> None:
+    tone = diagnosed(two_blades(1)).findings[0].effect
+    assert isinstance(tone, VibrationTone)
+    assert (tone.multiple, [one.multiple for one in tone.harmonics]) == (2, [1, 3, 5])
+    sizes = torch.tensor([0.25, 0.2, 0.2])[:, None].expand(-1, 3)
+    found = torch.stack([torch.hypot(one.cosine, one.sine) for one in tone.harmonics])
+    torch.testing.assert_close(found, sizes.to(found), atol=5 * math.sqrt(2 / N), rtol=0)
 
 
 @pytest.mark.statistical

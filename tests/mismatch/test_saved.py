@@ -37,7 +37,7 @@ from gyrofuse.mismatch.mechanisms.signals.quadratic_coupling import QuadraticCou
 from gyrofuse.mismatch.mechanisms.signals.scale_factor import ScaleFactor
 from gyrofuse.mismatch.mechanisms.signals.sensor_delay import SensorDelay
 from gyrofuse.mismatch.mechanisms.signals.time_scale import TimeScale
-from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
+from gyrofuse.mismatch.mechanisms.signals.tone import Harmonic, VibrationTone
 from gyrofuse.mismatch.mechanisms.signals.tone_amplitude import ToneSize
 from gyrofuse.mismatch.mechanisms.slow.bias_oscillation import BiasOscillation
 from gyrofuse.mismatch.mechanisms.slow.late_warm_up import LateWarmUp
@@ -135,6 +135,13 @@ EVERY = (
         10.0,
     ),
     VibrationTone(7.3, numbers(0.3, 0.0), numbers(0.1, 0.2)),
+    VibrationTone(
+        12.5,
+        numbers(1 / 3, 0.0),
+        numbers(0.0, 0.1),
+        2,
+        (Harmonic(1, numbers(0.1, 0.2), numbers(0.0, 1 / 3)), Harmonic(5, numbers(0.0, 0.2), numbers(0.3, 0.1))),
+    ),
     TimeScale(
         1.04 / 3 + 0.7,
         (7.3, 20 / 3),

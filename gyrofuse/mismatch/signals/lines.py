@@ -33,7 +33,7 @@ from gyrofuse.mismatch.signals.records import Records
 from gyrofuse.mismatch.stats.multiplicity import sidak
 
 _FINER = 4  # bins of the padded transform in a bin of the record: a line between two loses 5 % of its power
-_GUARD = 3  # bins next to a line, which hold its main lobe and are no background
+GUARD = 3  # bins next to a line, which hold its main lobe and are no background
 _NARROW, _WIDE = 32, 512  # bins on either side that estimate the background
 
 
@@ -76,10 +76,12 @@ def strongest_line(observed: Records, reference: Records) -> FoundLine:
     shortest = min(observed.signal.shape[-1], reference.signal.shape[-1])
     known = torch.zeros_like(f, dtype=torch.bool)
     for line in _shared(simulated_lines(reference), observed, reference):
-        here = (f - line).abs() < (_GUARD + 1) / shortest
+        here = (f - line).abs() < (GUARD + 1) / shortest
         known |= here | ((f - line).abs() < _reach(z[:, here]) / observed.signal.shape[-1])
     lines = _lines(z, length, observed, reference.base, known)
-    order = lines.log_p.argsort().tolist()
+    # Of lines that are all beyond doubt the strongest is the first: by how much they are depends on the bins nearby.
+    beyond_doubt = -100.0  # logarithm of a p value
+    order = lines.log_p.clamp(min=beyond_doubt).argsort(stable=True).tolist()
     at = next((k for k in order if not _as_faint(float(lines.frequency[k]), observed, reference)), order[-1])
     # Neighbouring fine bins share their noise: 0.6 of them are independent.
     p_value = sidak(math.exp(float(lines.log_p[at])), 0.6 * lines.n_bins)
@@ -167,7 +169,7 @@ def _steady(side: Records, lines: tuple[float, ...]) -> tuple[float, ...]:
 
 def _reach(z: Tensor) -> float:
     """Bins up to which the side lobes `1 / (pi d)^2` of a line `(sensor, bin)` are above a tenth of the noise."""
-    return max(_GUARD + 1.0, math.sqrt(float(z.abs().square().sum(0).amax()) / 0.1) / math.pi)
+    return max(GUARD + 1.0, math.sqrt(float(z.abs().square().sum(0).amax()) / 0.1) / math.pi)
 
 
 def _lines(z: Tensor, length: int, side: Records, base: NoiseSpectrum, known: Tensor) -> Lines:
@@ -175,7 +177,7 @@ def _lines(z: Tensor, length: int, side: Records, base: NoiseSpectrum, known: Te
     p, n = len(z), side.signal.shape[-1]
     fine = length / n  # fine bins in a bin
     bins = torch.arange(z.shape[-1])
-    known = known | (bins < 10 * fine) | (bins > (n / 2 - _GUARD) * fine)
+    known = known | (bins < 10 * fine) | (bins > (n / 2 - GUARD) * fine)
     band = torch.tensor(side.bands.edges[1:-1], dtype=torch.float64) / side.bands.n_samples
     of_band = torch.bucketize(bins / length, band, right=True)
     inverses = torch.linalg.inv(side.over(base))  # (band, sensor, sensor)
@@ -186,11 +188,12 @@ def _lines(z: Tensor, length: int, side: Records, base: NoiseSpectrum, known: Te
     # Over what is around, the line itself included: in a stop band of the recording the edge is far above any line.
     around = avg_pool1d(q[None, None], 2 * _NARROW * _FINER + 1, 1, _NARROW * _FINER, count_include_pad=False)[0, 0]
     at = (q / around.clamp(min=1e-300) * peak).topk(min(64, len(q))).indices
+    at = at[z[:, at].abs().square().sum(0).argsort(descending=True)]
     inverse = inverses[of_band[at]]
     matrices, m = _nearby(z, at, fine, inverse)
     here = z[:, at].mT  # (candidate, sensor)
     sets, log_chance = sets_of(p)
-    log_any = _log_hotelling(here, matrices, sets, m)
+    log_any = log_hotelling(here, matrices, sets, m)
     signatures = sets / base.spectrum(at / length).sqrt().mT[:, None, :]  # (candidate, set, sensor)
     filters = signatures.to(z.dtype) @ inverse.mT  # rows h^H, since C is Hermitian
     power = (filters @ here[..., None])[..., 0].abs().square()
@@ -211,7 +214,7 @@ def _nearby(z: Tensor, at: Tensor, fine: float, inverse: Tensor) -> tuple[Tensor
         fine: Fine bins in a bin.
         inverse: Of the covariances in their bands, `(candidate, sensor, sensor)`.
     """
-    apart = torch.cat([torch.arange(-_WIDE, -_GUARD), torch.arange(_GUARD + 1, _WIDE + 1)])
+    apart = torch.cat([torch.arange(-_WIDE, -GUARD), torch.arange(GUARD + 1, _WIDE + 1)])
     beside = at[:, None] + (apart * fine).round().long()
     usable = (beside >= fine) & (beside < z.shape[-1] - fine)
     usable &= apart.abs() <= (at / fine / 2).clamp(min=_NARROW)[:, None]
@@ -229,7 +232,7 @@ def _nearby(z: Tensor, at: Tensor, fine: float, inverse: Tensor) -> tuple[Tensor
     return torch.where(hump[:, None, None], narrow, wide) / m[:, None, None], m[:, None]
 
 
-def _log_hotelling(z: Tensor, matrices: Tensor, sets: Tensor, m: Tensor) -> Tensor:
+def log_hotelling(z: Tensor, matrices: Tensor, sets: Tensor, m: Tensor) -> Tensor:
     """Logarithm of the p value of lines of any amplitudes and phases, `(candidate, set)`.
 
     Args:

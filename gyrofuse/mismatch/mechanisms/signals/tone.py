@@ -1,10 +1,10 @@
-"""A stationary tone: a rotor, a fan, a pump."""
+"""A stationary tone, with its harmonics: a rotor, a fan, a pump, a supply that switches."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
 import torch
@@ -15,12 +15,16 @@ from gyrofuse._base.transforms import squared_modulus
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter, Rival
+from gyrofuse.mismatch.mechanisms.signals.harmonics import (
+    Harmonics,
+    folded,
+    harmonics_of,
+    surroundings,
+    tapered,
+)
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
-from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples
-from gyrofuse.mismatch.signals.psd import hann_transform
-from gyrofuse.mismatch.signals.records import Records
 from gyrofuse.mismatch.stats.inclusion import included_sensors
 from gyrofuse.mismatch.stats.limits import Z
 
@@ -29,14 +33,30 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
+class Harmonic:
+    """What a periodic motion has at another multiple of its fundamental frequency than its tone.
+
+    Attributes:
+        multiple: Which one.
+        cosine, sine: `(sensor,)`, unit of the signal; `t` counts from the first sample.
+    """
+
+    multiple: int
+    cosine: OfSensors
+    sine: OfSensors
+
+
+@dataclass(frozen=True, eq=False)
 class VibrationTone(Mechanism):
-    """`x_i(t) = cosine_i cos(2 pi f t) + sine_i sin(2 pi f t)` in every sensor `i`.
+    """`x_i(t) = cosine_i cos(2 pi f t) + sine_i sin(2 pi f t)` in every sensor `i`, and harmonics of that.
 
     Samples at one rate `f_s` do not tell `f` from `k f_s - f` and `k f_s + f`.
 
     Attributes:
         frequency_hz: `f`, one for all sensors.
         cosine, sine: `(sensor,)`, unit of the signal; `t` counts from the first sample.
+        multiple: Of the fundamental frequency, that it is.
+        harmonics: At others; none by default.
     """
 
     name: ClassVar[str] = "vibration_tone"
@@ -47,6 +67,8 @@ class VibrationTone(Mechanism):
     frequency_hz: float
     cosine: OfSensors
     sine: OfSensors
+    multiple: int = 1
+    harmonics: tuple[Harmonic, ...] = ()
 
     @property
     def amplitude(self) -> Tensor:
@@ -59,19 +81,26 @@ class VibrationTone(Mechanism):
         if line.p_value > level:
             return None
         tone = cls.at(comparison, line.frequency * comparison.info.rate)
-        f = tone.frequency_hz / comparison.info.rate
-        n, noise = comparison.n_samples, density_near(comparison, f)  # (sensor,)
-        sd = (2 * noise / n).sqrt()
-        snr = tone.amplitude / sd
-        there = included_sensors(snr.square(), 2)
-        present, seen = there.positions, math.sqrt(there.least)
-        # Noise adds to the squares of amplitudes, but has no information on the frequency.
-        energy = max(float((snr.square() - 2).clamp(min=0.0)[list(present)].sum()), 1.0)
-        spread = math.hypot(math.sqrt(12 / energy) / (2 * math.pi * n), tone.wander(comparison, noise, energy))
+        spread = tone._frequency_sd(comparison)
+        series = harmonics_of(comparison, tone.frequency_hz / comparison.info.rate, spread)
+        if series.others:
+            tone = tone.with_harmonics(comparison, series)
+            spread = tone._frequency_sd(comparison)
+        sd, squares = tone._sd(comparison), tone._squares(comparison)
+        snr = squares[0].sqrt()
+        there = included_sensors(squares[0], 2)
+        seen, certain, most_told = math.sqrt(there.least), 30.0, 6  # square of a harmonic; harmonics with limits
+        present = tuple((there.which | (squares[1:] > certain).any(0)).nonzero()[:, 0].tolist())
         parameters = {"frequency": _limits(tone.frequency_hz, spread * comparison.info.rate, "Hz")}
-        low, value, high = sd[list(present)] * amplitude_limits(snr[list(present)], seen)
+        low, value, high = sd[0, list(present)] * amplitude_limits(snr[list(present)], seen)
         for row in zip(present, value.tolist(), low.tolist(), high.tolist(), strict=True):
             parameters[f"amplitude[{row[0]}]"] = Parameter(*row[1:], comparison.info.measure)
+        for k in sorted((squares[1:].amax(-1).argsort(descending=True)[:most_told] + 1).tolist()):
+            harmonic, i = tone.harmonics[k - 1], int(squares[k].argmax())
+            size, reach = float(torch.hypot(harmonic.cosine[i], harmonic.sine[i])), Z * float(sd[k, i])
+            parameters[f"harmonic_{harmonic.multiple}[{i}]"] = Parameter(
+                size, size - reach, size + reach, comparison.info.measure
+            )
         largest = max(present, key=lambda i: parameters[f"amplitude[{i}]"].value)
         info = comparison.info
         where = info.named(present, "all sensors")
@@ -80,15 +109,66 @@ class VibrationTone(Mechanism):
             tone,
             f"a tone at {tone.frequency_hz:.6g} Hz in {where}, of amplitude up to "
             f"{parameters[f'amplitude[{largest}]'].value:.3g} {info.measure} (sensor {info.sensors[largest]}), "
-            f"that the simulation does not have; without a filter before sampling it may be one at "
-            f"{info.rate - tone.frequency_hz:.6g}, {info.rate + tone.frequency_hz:.6g} .. Hz",
+            f"that the simulation does not have; {tone._besides(info)}",
             line.p_value,
             present,
             parameters,
-            levels=(level_of(f),),
+            levels=(level_of(line.frequency),),
             frequency_hz=tone.frequency_hz,
-            gain=float(snr.square().sum()) / 2,
+            gain=float(squares.sum()) / 2,
         )
+
+    def _besides(self, info: RecordingInfo) -> str:
+        """Words of its harmonics, or of what else it may be."""
+        f = self.frequency_hz
+        if not self.harmonics:
+            return f"without a filter before sampling it may be one at {info.rate - f:.6g}, {info.rate + f:.6g} .. Hz"
+        multiples, fewest = [str(one.multiple) for one in self.harmonics], 8
+        if len(multiples) > fewest:
+            multiples[fewest - 2 : -1] = [".."]
+        many = "a harmonic" if len(self.harmonics) == 1 else f"{len(self.harmonics)} harmonics"
+        own = "" if self.multiple == 1 else f", of which it is {self.multiple} times"
+        return (
+            f"with {many} at {', '.join(multiples)} times {f / self.multiple:.6g} Hz{own}, as of something periodic; "
+            "those above half the rate are seen folded"
+        )
+
+    def _frequency_sd(self, comparison: Comparison) -> float:
+        """Standard deviation of its frequency, by the noise and a phase that walks, cycles per sample."""
+        # Noise adds to the squares of amplitudes, but has no information on the frequency.
+        squares = (self._squares(comparison) - 2).clamp(min=0.0)
+        present = included_sensors(squares[0] + 2, 2).which
+        own = max(float(squares[0, present].sum()), 1.0)
+        ratios = torch.tensor([h.multiple / self.multiple for h in self.harmonics], dtype=torch.float64)
+        energy = own + float((ratios.square()[:, None] * squares[1:]).sum())
+        n, noise = comparison.n_samples, density_near(comparison, self.frequency_hz / comparison.info.rate)
+        return math.hypot(math.sqrt(12 / energy) / (2 * math.pi * n), self.wander(comparison, noise, own))
+
+    def _sd(self, comparison: Comparison) -> Tensor:
+        """Standard deviation of each amplitude, `(1 + harmonic, sensor)`."""
+        densities = [density_near(comparison, f) for f in self._places(comparison.info)]
+        return (2 * torch.stack(densities) / comparison.n_samples).sqrt()
+
+    def _squares(self, comparison: Comparison) -> Tensor:
+        """Squares of amplitudes over their variances, `(1 + harmonic, sensor)`."""
+        parts = torch.stack([torch.hypot(cosine, sine) for _, cosine, sine in self._parts()])
+        return (parts / self._sd(comparison)).square()
+
+    def _parts(self) -> list[tuple[float, Tensor, Tensor]]:
+        """Its own and those of its harmonics: multiples of its frequency, cosines and sines."""
+        own = [(1.0, self.cosine, self.sine)]
+        return own + [(one.multiple / self.multiple, one.cosine, one.sine) for one in self.harmonics]
+
+    def _places(self, info: RecordingInfo) -> list[float]:
+        """Where these are seen, cycles per sample."""
+        ratios = torch.tensor([ratio for ratio, _, _ in self._parts()], dtype=torch.float64)
+        return folded(ratios * self.frequency_hz / info.rate).tolist()
+
+    def with_harmonics(self, comparison: Comparison, series: Harmonics) -> VibrationTone:
+        """The same with lines at multiples of a fundamental frequency."""
+        none = torch.zeros_like(self.cosine)
+        more = replace(self, multiple=series.multiple, harmonics=tuple(Harmonic(k, none, none) for k in series.others))
+        return more._fitted(comparison, torch.ones(comparison.n_samples, dtype=torch.bool))
 
     @classmethod
     def fit_in_place_of(cls, finding: Finding, comparison: Comparison) -> Rival | None:
@@ -152,29 +232,49 @@ class VibrationTone(Mechanism):
     @classmethod
     def fitted_to(cls, comparison: Comparison, frequency_hz: float, keep: Tensor) -> VibrationTone:
         """Least squares with the noise near the tone as weights, starting within half a bin of the samples' span."""
-        weights = 1 / density_near(comparison, frequency_hz / comparison.info.rate)
+        none = torch.zeros(comparison.n_sensors, dtype=torch.float64)
+        return cls(frequency_hz, none, none)._fitted(comparison, keep)
+
+    def _fitted(self, comparison: Comparison, keep: Tensor) -> VibrationTone:
+        """Frequency and amplitudes by least squares on samples to keep, from where the frequency stands."""
+        stretch, rate = 2**18, comparison.info.rate  # samples at a time
+        ratios = torch.tensor([ratio for ratio, _, _ in self._parts()], dtype=torch.float64)
+        weights = 1 / torch.stack([density_near(comparison, f) for f in self._places(comparison.info)])
         t = torch.arange(comparison.n_samples, dtype=torch.float64)[keep]
         signal = comparison.recording[:, keep]
         signal = signal - signal.mean(-1, keepdim=True)
-        span = float(t[-1] - t[0]) + 1
-        omega, clock = 2 * math.pi * frequency_hz / comparison.info.rate, (t - t.mean()) / span
+        span, m = float(t[-1] - t[0]) + 1, len(ratios)
+        omega, middle = 2 * math.pi * self.frequency_hz / rate, t.mean()
         for _ in range(6):
-            angle = omega * t
-            tone = torch.stack([angle.cos(), angle.sin()])
-            basis = torch.cat([tone, clock * tone])
-            gram, seen = basis @ basis.mT, basis @ signal.mT
-            gram = gram + 1e-12 * gram.trace() * torch.eye(4, dtype=gram.dtype)  # next to half the rate sines vanish
-            at = torch.linalg.solve(gram[:2, :2], seen[:2])  # (2, sensor)
-            slope = torch.stack([at[1], -at[0]])  # of the phase, on the clock
-            slope = torch.cat([-torch.linalg.solve(gram[:2, :2], gram[:2, 2:] @ slope), slope])  # (4, sensor)
-            left = seen - gram[:, :2] @ at
-            step = (weights * (slope * left).sum(0)).sum() / (weights * (slope * (gram @ slope)).sum(0)).sum()
+            gram = torch.zeros(4 * m, 4 * m, dtype=torch.float64)
+            seen = torch.zeros(4 * m, len(signal), dtype=torch.float64)
+            for part, times in zip(signal.split(stretch, -1), t.split(stretch), strict=True):
+                angle = omega * ratios[:, None] * times
+                tones = torch.cat([angle.cos(), angle.sin()])
+                basis = torch.cat([tones, (times - middle) / span * tones])
+                gram, seen = gram + basis @ basis.mT, seen + basis @ part.mT
+            gram = gram + 1e-12 * gram.trace() * torch.eye(
+                4 * m, dtype=gram.dtype
+            )  # next to half the rate sines vanish
+            at = torch.linalg.solve(gram[: 2 * m, : 2 * m], seen[: 2 * m])  # (cosines then sines, sensor)
+            # Of the phases, on the clock: each multiple turns as many times as fast.
+            slope = ratios.repeat(2)[:, None] * torch.cat([at[m:], -at[:m]])
+            slope = torch.cat([-torch.linalg.solve(gram[: 2 * m, : 2 * m], gram[: 2 * m, 2 * m :] @ slope), slope])
+            left = seen - gram[:, : 2 * m] @ at
+            each = weights.repeat(4, 1)
+            step = (each * slope * left).sum() / (each * slope * (gram @ slope)).sum()
             omega += float(step.clamp(-1.0, 1.0)) / span
-        return cls(omega * comparison.info.rate / (2 * math.pi), at[0], at[1])
+        cosines, sines = at[:m], at[m:]
+        harmonics = tuple(
+            replace(one, cosine=cosine, sine=sine)
+            for one, cosine, sine in zip(self.harmonics, cosines[1:], sines[1:], strict=True)
+        )
+        return replace(
+            self, frequency_hz=omega * rate / (2 * math.pi), cosine=cosines[0], sine=sines[0], harmonics=harmonics
+        )
 
     def fit_without(self, comparison: Comparison, fold: int) -> VibrationTone:
-        keep = estimation_samples(comparison.n_samples, fold)
-        return self.fitted_to(comparison, self.frequency_hz, keep)
+        return self._fitted(comparison, estimation_samples(comparison.n_samples, fold))
 
     def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
         pictures.spectrum_near(ax, comparison, sensor, self.frequency_hz, comparison.info.rate / comparison.n_samples)
@@ -192,37 +292,31 @@ class VibrationTone(Mechanism):
     def apply_elsewhere(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
         """A line that the simulation has: its phase counts from when a record began."""
         built = self.apply_to_reference(comparison, generator)
-        return built.knowing((*comparison.reference.lines, self.frequency_hz / comparison.info.rate))
+        return built.knowing((*comparison.reference.lines, *self._places(comparison.info)))
 
     def _path(self, n_samples: int, info: RecordingInfo, turn: float = 0.0) -> Tensor:
-        angle = 2 * math.pi * self.frequency_hz * info.seconds(n_samples) + turn
-        return self.cosine[:, None] * angle.cos() + self.sine[:, None] * angle.sin()
+        angle = 2 * math.pi * self.frequency_hz * info.seconds(n_samples) + turn * self.multiple
+        path = torch.zeros(len(self.cosine), n_samples, dtype=torch.float64)
+        for ratio, cosine, sine in self._parts():
+            path = path + cosine[:, None] * (ratio * angle).cos() + sine[:, None] * (ratio * angle).sin()
+        return path
 
 
 def density_near(comparison: Comparison, f: float) -> Tensor:
     """Noise of the recording around a line, without the line itself, per sample `(sensor,)`."""
-    power, length = _tapered_power(comparison.observed)
-    reach, guard = 64, 3  # bins on either side that tell the noise, and those too near to
-    apart = torch.cat([torch.arange(-reach, -guard), torch.arange(guard + 1, reach + 1)])
-    places = f + apart / comparison.n_samples
-    places = places[(places > 2.5 / comparison.n_samples) & (places < 0.5 - 0.5 / comparison.n_samples)]
-    here = comparison.base.spectrum(torch.tensor([f], dtype=torch.float64))
-    return (power[:, (places * length).round().long()] / comparison.base.spectrum(places) * here).mean(-1)
+    reach = 64  # bins on either side
+    beside, _ = surroundings(comparison, torch.tensor([f], dtype=torch.float64), reach)
+    return squared_modulus(beside[:, 0]).nanmean(-1)
 
 
 def line_near(comparison: Comparison, f: float, reach: float) -> float:
     """The highest place of the recording's spectrum over the simulation's noise within a reach, cycles per sample."""
-    power, length = _tapered_power(comparison.observed)
+    transform, length = tapered(comparison.observed)
     first, last = max(math.floor((f - reach) * length), 1), min(math.ceil((f + reach) * length), length // 2 - 1)
     place = torch.arange(first, last + 1, dtype=torch.float64) / length
-    return float(place[(power[:, first : last + 1] / comparison.base.spectrum(place)).sum(0).argmax()])
-
-
-@derived
-def _tapered_power(side: Records) -> tuple[Tensor, int]:
-    """Periodogram `(sensor, bin)` of a recording under a Hann taper, and the length it was padded to."""
-    transform, length = hann_transform(side.signal[0])
-    return squared_modulus(transform), length
+    return float(
+        place[(squared_modulus(transform[:, first : last + 1]) / comparison.base.spectrum(place)).sum(0).argmax()]
+    )
 
 
 def amplitude_limits(snr: Tensor, seen: float) -> Tensor:
