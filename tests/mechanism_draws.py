@@ -28,6 +28,7 @@ from gyrofuse.mismatch.mechanisms.signals.channel_coupling import ChannelCouplin
 from gyrofuse.mismatch.mechanisms.signals.channel_transfer import ChannelTransfer
 from gyrofuse.mismatch.mechanisms.signals.clock import ClockSkew
 from gyrofuse.mismatch.mechanisms.signals.g_sensitivity import GSensitivity
+from gyrofuse.mismatch.mechanisms.signals.motion import Motion
 from gyrofuse.mismatch.mechanisms.signals.quadratic_coupling import QuadraticCoupling
 from gyrofuse.mismatch.mechanisms.signals.scale_factor import ScaleFactor
 from gyrofuse.mismatch.mechanisms.signals.sensor_delay import SensorDelay
@@ -274,6 +275,18 @@ def _(setting: Setting) -> Drawn:
     one = torch.ones(1, dtype=torch.float64)
     effect = Pulses(0 * one, width * one, one, size[None], seconds / n)
     return Drawn(effect, {"rate": 3600 * n / seconds, "width": width} | setting.of_each("amplitude", size))
+
+
+@draws(Motion)
+def _(setting: Setting) -> Drawn:
+    seconds, p = setting.n_samples / RATE, len(setting.sizes(1.0, 1.0))
+    start, length = setting.even(0.1, 0.6) * seconds, setting.even(0.06, 0.12) * seconds
+    size = setting.sizes(1.5, 2.5) * setting.size
+    one = torch.ones(1, dtype=torch.float64)
+    root = torch.eye(p, dtype=torch.float64) + 0.7 * torch.ones(p, p, dtype=torch.float64).tril(-1)
+    root = size[:, None] * root / root.norm(dim=-1, keepdim=True)
+    effect = Motion(start * one, (start + length) * one, root[None], (10 * root @ root.mT)[None], 12.0 / RATE * one)
+    return Drawn(effect, {"start": start, "stop": start + length} | setting.of_each("rms", size))
 
 
 @draws(Chirp)

@@ -94,6 +94,12 @@ def two_blades(seed: int) -> np.ndarray:
     return noise(seed) + sum(size * np.cos(2 * math.pi * k * 8.4321 * T + k) for k, size in parts)
 
 
+def handled(seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    turns = signal.sosfilt(signal.butter(2, [0.5, 4], "band", fs=RATE, output="sos"), rng.standard_normal((3, N)))
+    return noise(seed) + 2 * turns / turns.std() * ((T > 41) & (T < 47))
+
+
 def started_anew(seed: int) -> np.ndarray:
     x = noise(seed)
     x[1] += np.where(T >= 31.234, 0.5 * np.exp(-(T - 31.234).clip(0) / 7), 0.0)
@@ -161,6 +167,7 @@ CASES = {
         ("vibration_tone",),
         {"vibration_tone.frequency": 2 * 8.4321, "vibration_tone.amplitude[1]": 0.7},
     ),
+    "handled": Case(handled, ("motion",), {}),
     "started anew": Case(
         started_anew,
         ("warm_up_transient",),

@@ -33,6 +33,7 @@ from gyrofuse.mismatch.mechanisms.signals.channel_coupling import ChannelCouplin
 from gyrofuse.mismatch.mechanisms.signals.channel_transfer import ChannelTransfer
 from gyrofuse.mismatch.mechanisms.signals.clock import ClockSkew
 from gyrofuse.mismatch.mechanisms.signals.g_sensitivity import GSensitivity
+from gyrofuse.mismatch.mechanisms.signals.motion import Motion
 from gyrofuse.mismatch.mechanisms.signals.quadratic_coupling import QuadraticCoupling
 from gyrofuse.mismatch.mechanisms.signals.scale_factor import ScaleFactor
 from gyrofuse.mismatch.mechanisms.signals.sensor_delay import SensorDelay
@@ -165,6 +166,13 @@ EVERY = (
     ),
     Step(numbers(0.0, 1 / 3), torch.zeros(2, 4, dtype=torch.float64), 3.3),
     Ramp(numbers(0.0, 1 / 3), torch.zeros(2, 4, dtype=torch.float64), 3.3),
+    Motion(
+        numbers(1.5, 4.0),
+        numbers(2.0, 5.0),
+        torch.tensor([[[0.5, 0.0], [0.2, 1 / 3]], [[0.1, 0.0], [0.0, 0.1]]], dtype=torch.float64),
+        torch.tensor([[[9.0, 1.0], [1.0, 1 / 3]], [[2.0, 0.0], [0.0, 3.0]]], dtype=torch.float64),
+        numbers(0.1, 0.3),
+    ),
     VarianceChange(((1.5, 3.25), (6.0, 7.0)), numbers(2.0, 1.0), 1 / 3),
     GradualChange(numbers(0.0, 1 / 3, 9.0), numbers(0.0, 0.7, 1.0), numbers(0.9, 1.0), numbers(1 / 3, 1.0), 0.1),
     ParameterShift(BASE, torch.tensor([[0.1, 0.0], [1 / 3, 0.0], [0.0, 0.0], [0.2, 0.1]], dtype=torch.float64)),

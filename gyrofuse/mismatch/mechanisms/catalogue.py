@@ -26,6 +26,7 @@ from gyrofuse.mismatch.mechanisms.signals.channel_coupling import ChannelCouplin
 from gyrofuse.mismatch.mechanisms.signals.channel_transfer import ChannelTransfer
 from gyrofuse.mismatch.mechanisms.signals.clock import ClockSkew
 from gyrofuse.mismatch.mechanisms.signals.g_sensitivity import GSensitivity
+from gyrofuse.mismatch.mechanisms.signals.motion import Motion
 from gyrofuse.mismatch.mechanisms.signals.quadratic_coupling import QuadraticCoupling
 from gyrofuse.mismatch.mechanisms.signals.scale_factor import ScaleFactor
 from gyrofuse.mismatch.mechanisms.signals.sensor_delay import SensorDelay
@@ -67,6 +68,7 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (Spikes, ScaleMixture),
     (ClockSkew, TimeScale),
     (GSensitivity, QuadraticCoupling, ScaleFactor, ChannelCoupling, ChannelTransfer),
+    (Motion,),  # whose smooth course looks like any of these
     (Chirp,),  # which passes any frequency
     (RingDown, Pulses),  # whose strongest are lines too
     (VibrationTone, ToneInSpells, ToneSize, Interleaving),

@@ -213,6 +213,21 @@ def _from_a_time_on(bench: Bench, nats: float, course_of: Callable[[Array], Arra
     return replace(part, look_alikes=bench.rivals(part.signal, {"step": shapes.steps(bench)}), form=form)
 
 
+def handled(bench: Bench, nats: float) -> Part:
+    """Somebody moves the device for a while: every axis turns, smoothly, and comes to rest again."""
+    length = int(bench.n * bench.rng.uniform(0.03, 0.12))
+    start = int(bench.rng.uniform(0.05, 0.95) * (bench.n - length))
+    cut = math.exp(bench.rng.uniform(math.log(6 / length), math.log(0.03)))  # cycles per sample
+    turns = sps.sosfiltfilt(sps.butter(2, 2 * cut, output="sos"), bench.rng.standard_normal((3, length + 8000)))
+    window = sps.windows.tukey(length, 0.3)
+    axes = bench.rng.standard_normal((bench.base.white.shape[0], 3))
+    course = axes / np.linalg.norm(axes, axis=-1, keepdims=True) @ (turns[:, 4000:-4000] * window)
+    unit = np.zeros((len(axes), bench.n))
+    unit[:, start : start + length] = course / np.std(course)
+    part, _ = bench.shape("motion", nats, unit, time_s=start / bench.rate)
+    return replace(part, form="moved by hand")
+
+
 def thermal_loop(bench: Bench, nats: float) -> Part:
     """A bias with a share of the temperature and one of its rate of change, in every sensor others."""
     sensors = bench.some_sensors()

@@ -141,6 +141,7 @@ _FORMS: dict[str, Callable[[Bench, float], Part]] = {
     "two_time_constants": forms.two_time_constants,
     "heater": forms.heater,
     "restarted": forms.restarted,
+    "handled": forms.handled,
     "thermal_loop": forms.thermal_loop,
     "asymmetric_telegraph": _with(spectral.random_telegraph, asymmetries=(2.2, 3.2)),
     "ramp_of_level": forms.ramp_of_level,
