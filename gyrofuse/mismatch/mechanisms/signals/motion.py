@@ -33,7 +33,7 @@ class Motion(Transient):
     normal motion of the same covariance and smoothness.
 
     Attributes:
-        start_s, stop_s: s after the first sample, `(stretch,)`; the most conspicuous is the first.
+        start_s, stop_s: Of what is left out, s after the first sample, `(stretch,)`; the most conspicuous is the first.
         root: Root of the covariance of the motion, unit of the signal, `(stretch, sensor, sensor)`.
         louder: Covariance of whitened samples there, which is one at rest, `(stretch, sensor, sensor)`.
         smooth_s: Standard deviation of the kernel that makes white noise as smooth, s, `(stretch,)`.
@@ -53,35 +53,39 @@ class Motion(Transient):
         stretches = sorted(handled(comparison), key=lambda one: -one.log_ratio)
         if not stretches:
             return None
-        n, info = comparison.n_samples, comparison.info
+        n, info, seen = comparison.n_samples, comparison.info, stretches[0]
         gain = sum(one.log_ratio for one in stretches)
-        p_value = min(1.0, (n / stretches[0].cell) ** 2 * math.exp(-min(stretches[0].log_ratio, 700.0)))
+        p_value = min(1.0, (n / seen.cell) ** 2 * math.exp(-min(seen.log_ratio, 700.0)))
         if p_value > level:
             return None
-        effect = cls.fitted_to(comparison, [(one.first, one.end) for one in stretches], torch.ones(n, dtype=torch.bool))
-        first = stretches[0]
+        # It begins and ends gently: what is left of it would be something that decays.
+        margins = [(one.end - one.first) // 4 for one in stretches]
+        spans = [(max(s.first - m, 0), min(s.end + m, n)) for s, m in zip(stretches, margins, strict=True)]
+        effect = cls.fitted_to(comparison, spans, torch.ones(n, dtype=torch.bool))
         # It begins and ends somewhere in the outermost cells, which a mean over three of them reaches over.
-        inside, reach = 1.5 * first.cell / info.rate, 2 * first.cell / info.rate + 2 * float(effect.smooth_s[0])
-        start, stop = float(effect.start_s[0]) + inside, float(effect.stop_s[0]) - inside
+        inside, reach = 1.5 * seen.cell / info.rate, 2 * seen.cell / info.rate + 2 * float(effect.smooth_s[0])
+        start, stop = seen.first / info.rate + inside, seen.end / info.rate - inside
         parameters = {
             "start": Parameter(start, max(start - reach, 0.0), start + reach, "s"),
             "stop": Parameter(stop, stop - reach, min(stop + reach, n / info.rate), "s"),
         }
         which = tuple(torch.stack([one.which for one in stretches]).any(0).nonzero()[:, 0].tolist())
-        size = effect.root.square().sum(-1).sqrt()  # (stretch, sensor)
-        largest = max(which, key=lambda i: float(size[0, i]))
+        size = effect.root[0].square().sum(-1).sqrt()  # (sensor,)
+        size = size * math.sqrt((spans[0][1] - spans[0][0]) / (seen.end - seen.first))  # over what was seen
+        largest = max(which, key=lambda i: float(size[i]))
         free = max((stop - start) / (4 * float(effect.smooth_s[0])), 4.0)  # of values that are independent
         for i in which:
-            value = float(size[0, i])
+            value = float(size[i])
             spread = math.exp(2 / math.sqrt(2 * free))
             parameters[f"rms[{i}]"] = Parameter(value, value / spread, value * spread, info.measure)
+        moves = "moves" if len(which) == 1 else "move together"
         others = len(stretches) - 1
         more = f", and {others} more time{'s' if others > 1 else ''}" if others else ""
         return Finding(
             cls.name,
             effect,
-            f"the device is not at rest: {info.named(which, 'all sensors')} move together from {start:.4g} s to "
-            f"{stop:.4g} s{more}, by up to {float(size[0, largest]):.3g} {info.measure} rms (sensor "
+            f"the device is not at rest: {info.named(which, 'all sensors')} {moves} from {start:.4g} s to "
+            f"{stop:.4g} s{more}, by up to {float(size[largest]):.3g} {info.measure} rms (sensor "
             f"{info.sensors[largest]}); leave that part out, or give what moves it as a channel",
             p_value,
             which,
