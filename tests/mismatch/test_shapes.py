@@ -284,6 +284,10 @@ def test_what_sampling_leaves_of_an_analogue_filter_has_its_aliases(order: int):
         # Next to half the rate the image of the step is seen as well.
         ("window0", lambda at: signal.freqz(signal.firwin(29, 0.9), worN=at)[1]),
         ("window1", lambda at: signal.freqz(signal.firwin(15, 0.8), worN=at)[1]),
+        (
+            "damped4",
+            lambda at: signal.freqz(*signal.bilinear([1.0], [1.0, 1 / 1.2**4, 1.0], fs=0.5), worN=at)[1],
+        ),
         ("chebyshev4", lambda at: signal.sosfreqz(signal.cheby1(4, 0.5, 0.94, output="sos"), worN=at)[1]),
     ],
 )

@@ -22,7 +22,6 @@ from gyrofuse._base.transforms import fast_length
 
 _TAPERS = 4  # an even number
 _PER_OCTAVE = 4
-_TAPERED = 0.12  # share of the record under the ends of a light taper: spectral lines leak as far as twenty bins
 N_NODES = 8  # frequencies whose mean stands for the mean over a band
 _FIRST_BIN = 3  # below, positive and negative frequencies overlap
 
@@ -224,7 +223,8 @@ def hann_transform(signal: Tensor) -> tuple[Tensor, int]:
 
 def light_taper(n: int) -> Tensor:
     """For whitened samples `(n,)`, of squares that sum to one: one that holds back what is red costs half of them."""
-    taper = _planck_taper(n, round(n * _TAPERED / 2))
+    tapered = 0.12  # share of the record under its ends: spectral lines leak as far as twenty bins
+    taper = _planck_taper(n, round(n * tapered / 2))
     return taper / taper.square().sum().sqrt()
 
 

@@ -3,14 +3,16 @@
 A form is an analogue prototype `H(u)` that halves the power at `u = 1`, of a warped frequency `u = g(f) / g(f_c)`: `g =
 tan(pi f)` of the bilinear transform, or `g = 2 f` of an analogue filter in front of the converter, whose noise beyond
 half the rate is folded back: `sum_k |H(g(f + k) / g(f_c))|^2` over its value at 0. A Gaussian window cuts a FIR
-filter's ideal step off smoothly; pass bands with ripples have half a decibel of them. Beside those stand one and two
-poles `(1 - q) / (1 - q / z)`, the mean over `a` samples, the last of which counts in part, and what sampling leaves of
-analogue means over `a` samples, `sum_k sinc(a (f + k))^2m` over its value at 0: one mean, as of a converter that
-integrates, or two in a row, which weigh in a triangle.
+filter's ideal step off smoothly; pass bands with ripples have half a decibel of them; two poles that are damped less
+than Butterworth's let more pass where they resonate. Beside those stand one and two poles `(1 - q) / (1 - q / z)`, the
+mean over `a` samples, the last of which counts in part, and what sampling leaves of analogue means over `a` samples,
+`sum_k sinc(a (f + k))^2m` over its value at 0: one mean, as of a converter that integrates, or two in a row, which
+weigh in a triangle.
 """
 
 from __future__ import annotations
 
+import cmath
 import functools
 import math
 from typing import NamedTuple
@@ -25,9 +27,10 @@ class _Form(NamedTuple):
 
     Attributes:
         warp: "tan" or "straight".
-        prototype: "butterworth", "bessel", "chebyshev", "window", or "folded": Butterworth's with its aliases.
+        prototype: "butterworth", "bessel", "chebyshev", "damped", "window", or "folded" (Butterworth's with aliases).
         order: Of all but the last.
-        width: Of a window's step, standard deviation over its middle.
+        width: Of a window's step, standard deviation over its middle; the damping ratio
+            of two "damped" poles; decibels of a Chebyshev filter's ripple.
         power: Of `g(f_c)^-2` that `strength` is.
     """
 
@@ -45,9 +48,10 @@ _FORMS = {
     "sampled2": _Form("straight", "butterworth", 2, power=2),
     **{f"bilinear{n}": _Form("tan", "butterworth", n) for n in (3, 4)},
     **{f"bessel{n}": _Form("tan", "bessel", n) for n in (2, 3, 4)},
-    "chebyshev4": _Form("tan", "chebyshev", 4),
-    "analogue2": _Form("straight", "folded", 2, power=2),
-    "analogue4": _Form("straight", "folded", 4, power=2),
+    **{f"chebyshev4{more}": _Form("tan", "chebyshev", 4, width=w) for more, w in (("", 0.5), ("_3dB", 3.0))},
+    # A suspension, or a filter that rings: damping ratios a factor of 1.2 apart, of which Butterworth's is 0.71.
+    **{f"damped{k}": _Form("tan", "damped", 2, width=0.5 / 1.2**k) for k in range(10)},
+    **{f"analogue{n}": _Form("straight", "folded", n, power=2) for n in (2, 4)},
     # Widths a factor of 1.6 apart: Hamming windows of 11 to 61 taps at a cutoff of a fifth of the rate.
     **{f"window{k}": _Form("straight", "window", width=0.08 * 1.6**k) for k in range(4)},
 }
@@ -55,7 +59,6 @@ _POLES = {"pole": 1.0, "poles": math.sqrt(2) - 1}
 _SAMPLED_MEANS = {"integrated": 1, "integrated2": 2}  # analogue means in a row
 _MEANS = {"average": 1, **_SAMPLED_MEANS}
 FILTERS = ("pole", "poles", *_MEANS, *_FORMS)
-_RIPPLE = 0.5  # dB of a Chebyshev filter's pass band
 _HALVINGS = 60  # of an interval: double precision
 _LONGEST = 0.9999  # pole: of a time constant of 10^4 samples
 
@@ -202,8 +205,8 @@ def filter_response(kind: str, strength: Tensor, f: Tensor) -> Tensor:
         return torch.complex(ends, torch.zeros_like(ends))
     response = torch.ones_like(u, dtype=torch.complex128)
     if form.prototype == "chebyshev":
-        response = torch.where(strength[..., None] > 0, _at_rest(form.order), 1.0) * response
-    for pole in _poles(form.prototype, form.order):
+        response = torch.where(strength[..., None] > 0, _at_rest(form), 1.0) * response
+    for pole in _poles(form):
         response = response * (-pole) / (1j * u - pole)
     return response
 
@@ -222,20 +225,28 @@ def _prototype_frequency(kind: str, strength: Tensor, f: Tensor) -> Tensor:
     return _warped(kind, f) * strength[..., None].clamp(min=0).pow(1 / (2 * _FORMS[kind].power))
 
 
-@functools.lru_cache(maxsize=16)
-def _poles(prototype: str, order: int) -> tuple[complex, ...]:
+@functools.lru_cache(maxsize=32)
+def _poles(form: _Form) -> tuple[complex, ...]:
     """Of a prototype that halves the power at one."""
-    if prototype == "bessel":
-        return tuple(complex(p) for p in signal.bessel(order, 1.0, analog=True, output="zpk", norm="mag")[1])
-    if prototype == "chebyshev":
-        half = math.cosh(math.acosh(math.sqrt(1 / (10 ** (_RIPPLE / 10) - 1))) / order)
-        return tuple(complex(p) / half for p in signal.cheby1(order, _RIPPLE, 1.0, analog=True, output="zpk")[1])
-    return tuple(complex(p) for p in signal.butter(order, 1.0, analog=True, output="zpk")[1])
+    if form.prototype == "damped":  # 1 / (1 - x^2 + 2 i d x), of power 1/2 at x^2 = 1 - 2 d^2 + sqrt((1 - 2 d^2)^2 + 1)
+        most = 1 - 2 * form.width**2
+        half = math.sqrt(most + math.hypot(most, 1))
+        angle = math.acos(form.width)
+        return tuple(-cmath.rect(1 / half, sign * angle) for sign in (-1, 1))
+    if form.prototype == "bessel":
+        return tuple(complex(p) for p in signal.bessel(form.order, 1.0, analog=True, output="zpk", norm="mag")[1])
+    if form.prototype == "chebyshev":
+        poles = signal.cheby1(form.order, form.width, 1.0, analog=True, output="zpk")[1]
+        ripple = math.sqrt(10 ** (form.width / 10) - 1)
+        # With ripples of more than halves it is within them that the power is halved, next to the last of all.
+        half = math.cosh(math.acosh(max(1 / ripple, 1.0)) / form.order)
+        return tuple(complex(p) / half for p in poles)
+    return tuple(complex(p) for p in signal.butter(form.order, 1.0, analog=True, output="zpk")[1])
 
 
-def _at_rest(order: int) -> float:
+def _at_rest(form: _Form) -> float:
     """Response with ripples at frequency 0: with an even number of poles they start from below."""
-    return 1.0 if order % 2 else 10 ** (-_RIPPLE / 20)
+    return 1.0 if form.order % 2 else 10 ** (-form.width / 20)
 
 
 @functools.lru_cache(maxsize=16)

@@ -25,9 +25,7 @@ if TYPE_CHECKING:
 
 
 _MILLION = 1e6
-_ROUNDS, _BLOCKS_AROUND = 2, 3  # of times of losses and amplitudes in turns, and blocks around each that are searched
-_FURTHER = 3  # times that more losses are looked for behind those that were found
-_AS_GOOD = 2.0  # nats within which another sample is as good: the 95 % limits of a likelihood ratio
+_BLOCKS_AROUND = 3  # around each loss that are searched
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,10 +68,11 @@ class ClockSkew(Mechanism):
         effect = effect._fitted(comparison, everywhere)
         limits = [loss.at_limits for loss in slip.losses]
         span: tuple[int, int] | None = slip.lost
-        for _ in range(_ROUNDS if losses else 0):
+        rounds, further = 2, 3  # times and amplitudes in turns; looks for more losses behind those that were found
+        for _ in range(rounds if losses else 0):
             effect, limits = effect._placed(comparison)
             effect = effect._fitted(comparison, everywhere)
-        for _ in range(_FURTHER if losses else 0):
+        for _ in range(further if losses else 0):
             more = effect._with_what_is_left(comparison, level)
             if more is None:
                 break
@@ -138,7 +137,7 @@ class ClockSkew(Mechanism):
 
         Until a loss the tone is what it was, from there on what it turns to: a loud tone places it to a sample.
         """
-        losses, limits = list(self.losses), []
+        losses, limits, as_good = list(self.losses), [], 2.0  # nats: 95 % limits of a likelihood ratio
         reach = _BLOCKS_AROUND * (comparison.n_samples // BLOCKS)
         for j, (at, count) in enumerate(losses):
             low = max(at - reach, losses[j - 1][0] + 1 if j else 1)
@@ -156,7 +155,7 @@ class ClockSkew(Mechanism):
             signal = comparison.white[list(self.sensors), low:high]
             gain = (signal * (before - after) - (before.square() - after.square()) / 2).sum(0).cumsum(0)
             gain = torch.nn.functional.pad(gain, (1, 0))  # of a loss before each sample from `low` to `high`
-            likely = (gain >= gain.amax() - _AS_GOOD).nonzero()[:, 0]
+            likely = (gain >= gain.amax() - as_good).nonzero()[:, 0]
             losses[j] = low + int(gain.argmax()), count
             limits.append((low + int(likely[0]), low + int(likely[-1])))
         return replace(self, losses=tuple(losses)), limits
