@@ -18,7 +18,7 @@ from gyrofuse.mismatch.detectors.spectra.shared_peak_scan import log_ratios
 from gyrofuse.mismatch.detectors.spectra.steadiness import steadiness
 from gyrofuse.mismatch.likelihoods.spectra.common_sources import CommonBump
 from gyrofuse.mismatch.likelihoods.spectra.components import oscillation
-from gyrofuse.mismatch.likelihoods.spectra.fit import fit, linearised
+from gyrofuse.mismatch.likelihoods.spectra.fit import fit, pieces, slopes_of_spectra
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import compared
 from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode, _momentary, _seen, excess_along, wandering_sd
 from gyrofuse.mismatch.mechanisms.spectra.resonance import Resonance
@@ -99,7 +99,8 @@ def test_backgrounds_that_nothing_holds_stay_numbers_that_can_be_worked_out():
     found = fit(data, [lost], rounds=1)
     assert bool(found.model.isfinite().all())
     assert bool(found.covariance.isfinite().all())
-    assert bool(linearised(data, found.terms)[1].isfinite().all())
+    parts = pieces(data, found.terms)
+    assert bool(slopes_of_spectra(data, found.terms, parts, parts.model(data)).isfinite().all())
 
 
 def test_a_line_is_no_bump_and_a_bump_of_both_sides_neither():

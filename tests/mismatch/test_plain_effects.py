@@ -194,6 +194,22 @@ def test_it_is_named_and_nothing_else_is(case: Case) -> None:
         assert abs(value - middle) < 1.7 * half, name  # of several limits of 95 %
 
 
+@pytest.mark.parametrize(("recorded", "said"), [(None, [40.0]), (70.0, [40.0, 70.0])])
+def test_a_filter_of_the_simulation_alone_is_told_as_such(recorded: float | None, said: list[float]) -> None:
+    """Or one of another corner than the recording's, of which the ratio of both is no filter."""
+
+    def filtered(x: np.ndarray, corner: float | None) -> np.ndarray:
+        sections = None if corner is None else signal.butter(2, corner, fs=RATE, output="sos")
+        return x[:, 200:] if sections is None else signal.sosfilt(sections, x)[:, 200:]
+
+    report = diagnosed(filtered(noise(1), recorded), filtered(noise(2), 40.0))
+    assert [f.mechanism for f in report.findings] == ["low_pass"] * len(said)
+    assert report.held_out.after < 2
+    assert "the simulation has a low-pass filter" in report.findings[0].sentence
+    for finding, corner in zip(report.findings, said, strict=True):
+        assert abs(finding.parameters["corner[0]"].value - corner) < 1
+
+
 def test_harmonics_are_those_of_the_fundamental_frequency() -> None:
     tone = diagnosed(two_blades(1)).findings[0].effect
     assert isinstance(tone, VibrationTone)

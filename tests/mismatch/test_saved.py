@@ -177,6 +177,7 @@ EVERY = (
     GradualChange(numbers(0.0, 1 / 3, 9.0), numbers(0.0, 0.7, 1.0), numbers(0.9, 1.0), numbers(1 / 3, 1.0), 0.1),
     ParameterShift(BASE, torch.tensor([[0.1, 0.0], [1 / 3, 0.0], [0.0, 0.0], [0.2, 0.1]], dtype=torch.float64)),
     LowPassFilter("pole", numbers(0.7, 0.0)),
+    LowPassFilter("bilinear2", numbers(0.7, 0.0), undone=True),
     NotchFilter(0.11, 1 / 3, numbers(0.7, 0.0)),
     Resonance(MODE),
     DriftingTone(MODE, True, 0.9),

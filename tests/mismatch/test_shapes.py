@@ -21,7 +21,15 @@ from gyrofuse.mismatch.detectors.spectra.shape_scan import shape_test
 from gyrofuse.mismatch.likelihoods.spectra.choice import keeps_own
 from gyrofuse.mismatch.likelihoods.spectra.coherence import smooth_coherence
 from gyrofuse.mismatch.likelihoods.spectra.common_sources import Common
-from gyrofuse.mismatch.likelihoods.spectra.components import Flicker, LowPass, PowerLaw, Shift, Term, oscillation
+from gyrofuse.mismatch.likelihoods.spectra.components import (
+    Flicker,
+    LowPass,
+    PowerLaw,
+    Shift,
+    SimulatedLowPass,
+    Term,
+    oscillation,
+)
 from gyrofuse.mismatch.likelihoods.spectra.data import block_spectra, fast_groups, slow_groups
 from gyrofuse.mismatch.likelihoods.spectra.filter_forms import (
     FILTERS,
@@ -34,9 +42,9 @@ from gyrofuse.mismatch.likelihoods.spectra.fit import (
     _power_slopes,
     data_model,
     fit,
-    linearised,
     pieces,
     slopes_of_powers,
+    slopes_of_spectra,
 )
 from gyrofuse.mismatch.likelihoods.spectra.noise_parts import Parts
 from gyrofuse.mismatch.likelihoods.spectra.ratios import FLOOR, Ratios, fitness, log_gain, power_gains
@@ -92,8 +100,9 @@ def test_score_and_information_are_those_of_the_likelihood():
     data = compared(drawn(1, lambda x, g: 1.5 * x, n=4096))
     terms = [LowPass.starts(data.ground, "bilinear")]
     terms = [replace(terms[0], local=terms[0].local[22].expand(1, P))]
-    model, derivatives = linearised(data, terms)
     parts = pieces(data, terms)
+    model = parts.model(data)
+    derivatives = slopes_of_spectra(data, terms, parts, model)
     power = parts.power(data)
     slopes = slopes_of_powers(data, terms, parts, power)
     for own, of_pairs in ((power, model), (slopes, derivatives)):  # what needs no pairs is the diagonal of what does
@@ -205,6 +214,7 @@ def shape_examples(data: Ratios) -> list[Term]:
     return [
         Shift.start(ground),
         replace(LowPass.starts(ground, "pole"), local=LowPass.starts(ground, "pole").local[22].expand(1, P)),
+        replace(SimulatedLowPass.starts(ground, "bilinear2"), local=torch.full((1, P), 0.3, dtype=torch.float64)),
         Flicker.start(ground),
         PowerLaw.like(Flicker.start(ground), ground),
         common,
@@ -214,7 +224,9 @@ def shape_examples(data: Ratios) -> list[Term]:
 def test_derivatives_are_those_of_the_model():
     data = compared(drawn(2, n=4096))
     terms = shape_examples(data)
-    model, slopes = linearised(data, terms)
+    parts = pieces(data, terms)
+    model = parts.model(data)
+    slopes = slopes_of_spectra(data, terms, parts, model)
     place = 0
     for k, term in enumerate(terms):
         for number in range(term.local.numel()):

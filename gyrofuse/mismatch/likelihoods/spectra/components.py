@@ -262,6 +262,16 @@ class LowPass(Term):
 
 
 @dataclass(frozen=True, eq=False)
+class SimulatedLowPass(LowPass):
+    """The same filter where it is the simulation that has it."""
+
+    acts: ClassVar[str] = "undo"
+
+    def turn(self, f: Tensor) -> Tensor:
+        return super().turn(f).conj()
+
+
+@dataclass(frozen=True, eq=False)
 class Flicker(Term):
     """`a / f` added: the local number is `a`."""
 

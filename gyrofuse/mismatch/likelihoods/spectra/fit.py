@@ -202,6 +202,7 @@ class Pieces(NamedTuple):
         factor: Factors on the noise, `(..., sensor, node)`.
         added: Densities added.
         filters: Factors on everything.
+        undone: Factors that the reference has on everything; None without.
         common: Cross-spectra of common sources over the reference's powers, `(band, sensor, sensor)`; None without.
         values: What each term does, in the order of the terms; of a common source its cross-spectra.
         turn: What filters turn everything by, complex of size one, `(band, sensor)`; None without such a filter. Steps
@@ -211,6 +212,7 @@ class Pieces(NamedTuple):
     factor: Tensor
     added: Tensor
     filters: Tensor
+    undone: Tensor | None = None
     common: Tensor | None = None
     values: tuple[Tensor, ...] = ()
     turn: Tensor | None = None
@@ -222,20 +224,27 @@ class Pieces(NamedTuple):
         divisor = 1.0 if instead is None else instead
         if acts == "scale":
             return self._replace(factor=self.factor / divisor * values)
-        return self._replace(filters=self.filters / torch.as_tensor(divisor).clamp(min=1e-300) * values)
+        factor = values / torch.as_tensor(divisor).clamp(min=1e-300)
+        if acts == "undo":
+            return self._replace(undone=factor if self.undone is None else self.undone * factor)
+        return self._replace(filters=self.filters * factor)
 
     def model(self, data: Ratios) -> Tensor:
         """Cross-spectra over the reference's powers, `(..., band, sensor, sensor)`."""
         ground, mean_of = data.ground, data.ground.bands.mean_of
-        size = (mean_of(self.factor * self.filters * ground.density) / ground.mean).clamp(min=0).sqrt().mT
-        extra = (mean_of(self.added * self.filters) / ground.mean).mT
+        size = (mean_of(self.factor * self.filters * ground.density) / self._own(ground)).clamp(min=0).sqrt().mT
+        extra = (mean_of(self.added * self.filters) / self._own(ground)).mT
         own = data.expected * (size[..., :, None] * size[..., None, :]) * self._turned() + torch.diag_embed(extra)
         return own if self.common is None else own + self.common * self.passed(ground)
 
     def passed(self, ground: Ground) -> Tensor:
         """Factors of filters on cross-spectra, `(..., band, sensor, sensor)`."""
-        gain = ground.bands.mean_of(self.filters).clamp(min=0).sqrt().mT
+        gain = (ground.bands.mean_of(self.filters) * ground.mean / self._own(ground)).clamp(min=0).sqrt().mT
         return gain[..., :, None] * gain[..., None, :] * self._turned()
+
+    def _own(self, ground: Ground) -> Tensor:
+        """The reference's powers, had it what is undone, `(..., sensor, band)`."""
+        return ground.mean if self.undone is None else ground.bands.mean_of(self.undone * ground.density)
 
     def _turned(self) -> Tensor | float:
         """Factors of size one on cross-spectra, `(band, sensor, sensor)`."""
@@ -244,8 +253,10 @@ class Pieces(NamedTuple):
     def power(self, data: Ratios) -> Tensor:
         """Powers over the reference's, `(..., band, sensor)`."""
         ground, mean_of = data.ground, data.ground.bands.mean_of
-        own = mean_of((self.factor * ground.density + self.added) * self.filters) / ground.mean
-        return own.mT if self.common is None else own.mT + powers(self.common) * mean_of(self.filters).mT
+        own = (mean_of((self.factor * ground.density + self.added) * self.filters) / self._own(ground)).mT
+        if self.common is None:
+            return own
+        return own + powers(self.common) * (mean_of(self.filters) * ground.mean / self._own(ground)).mT
 
 
 def pieces(data: Ratios, terms: Sequence[Term]) -> Pieces:
@@ -272,13 +283,6 @@ def _relative(ground: Ground, density: Tensor) -> Tensor:
     """Density `(..., node)` of a source over the noise of pairs of sensors, `(..., band, sensor, sensor)`."""
     level = ground.mean.mT.rsqrt()
     return ground.bands.mean_of(density)[..., None, None] * (level[:, :, None] * level[:, None, :])
-
-
-def linearised(data: Ratios, terms: Sequence[Term]) -> tuple[Tensor, Tensor]:
-    """Model and its derivatives `(number, band, sensor, sensor)` with respect to every number."""
-    parts = pieces(data, terms)
-    model = parts.model(data)
-    return model, slopes_of_spectra(data, terms, parts, model)
 
 
 def slopes_of_spectra(data: Ratios, terms: Sequence[Term], parts: Pieces, model: Tensor) -> Tensor:

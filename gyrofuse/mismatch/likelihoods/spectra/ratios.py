@@ -50,6 +50,7 @@ class Ratios:
         pair_dof: Complex ordinates of a correlation, `(band,)`; 0 where none counts.
         together: Sensors whose ratios vary with that of each, `(band, sensor)`: itself, and others by the square of
             their correlation.
+        power: Powers of the reference, `(band, sensor)`.
     """
 
     ground: Ground
@@ -60,6 +61,7 @@ class Ratios:
     usable: Tensor
     pair_dof: Tensor
     together: Tensor
+    power: Tensor
 
     @classmethod
     def of(
@@ -83,14 +85,15 @@ class Ratios:
         """
         (matrices, d), (power, s) = observed, reference
         known = (s > 0).to(d.dtype)
-        size = torch.where(known[:, None] > 0, power.clamp(min=1e-300), ground.mean.mT).rsqrt()
+        power = torch.where(known[:, None] > 0, power.clamp(min=1e-300), ground.mean.mT)
+        size = power.rsqrt()
         pair_dof = known * (d if independent else d * s / (d + s).clamp(min=1e-300))
         ratios = matrices * (size[:, :, None] * size[:, None, :])
         # The variance of a log ratio is 1 / d + 1 / s, and what two have in common of either is a squared coherence.
         seen, share = smooth_coherence(correlations(matrices), d), s / (d + s).clamp(min=1e-300)
         alike = share[:, None, None] * seen.abs().square() + (1 - share[:, None, None]) * expected.abs().square()
         together = alike.sum(-1).clamp(min=1.0)
-        return cls(ground, ratios, expected, d, s, usable * known[:, None], pair_dof * usable.amin(-1), together)
+        return cls(ground, ratios, expected, d, s, usable * known[:, None], pair_dof * usable.amin(-1), together, power)
 
     @property
     def n_sensors(self) -> int:

@@ -75,6 +75,9 @@ class LateWarmUp(SlowEffect):
         strong = strong_scan(comparison, cls.name, level)
         if strong is None or not cls.owns(strong.scan):
             return None
+        sure = 1e-6  # p value: where noise is louder for a while, something seems to jump and decay
+        if strong.scan.family.decays and strong.scan.p_value > sure:
+            return None
         step = strong.analysis.scan("step")
         if step is not None and step.gain > strong.scan.gain - NATS_AS_GOOD:  # which takes no time
             return None

@@ -36,7 +36,7 @@ from gyrofuse.mismatch.stats.segments import runs_of
 # Share of the discrepancy that terms have to explain to be named though their form is not quite the recording's: of
 # twenty-one filters of other forms than the catalogue's they explained 95 % at least.
 _LARGELY = 0.9
-_ORDER = {"scale": 0, "add": 1, "filter": 2}  # a filter acts on what was added, levels are those of the noise alone
+_ORDER = ("undo", "scale", "add", "filter")  # a filter acts on what was added, levels are those of the noise alone
 _QUICK, _FAR = 8, 20.0  # rounds of a fit that only ranks, and nats behind after them that are not made up
 _SHARP = 0.1  # half width of a peak over its centre, below which bands of blocks are too wide for it
 
@@ -231,7 +231,7 @@ def _first(data: Ratios, chosen: Fit, terms: list[Term]) -> tuple[int, float, bo
         alone = float(log_gain(data, data_model(data, [terms[i]])).sum())
         faint = losses[i] < losses[most] * (next_to_nothing if terms[most].acts == "filter" else 0.1)
         needed = losses[i] > losses[most] / 10
-        return faint or (alone < NEW_TERM_NATS and not needed), _ORDER[terms[i].acts], -alone
+        return faint or (alone < NEW_TERM_NATS and not needed), _ORDER.index(terms[i].acts), -alone
 
     first = min(range(len(terms)), key=rank)
     alone = all(losses[i] < next_to_nothing * losses[first] for i in range(len(terms)) if i != first)

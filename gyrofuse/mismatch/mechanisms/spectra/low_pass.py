@@ -9,9 +9,11 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.likelihoods.spectra.components import LowPass, Term
+from gyrofuse.mismatch.likelihoods.spectra.components import LowPass, SimulatedLowPass, Term
 from gyrofuse.mismatch.likelihoods.spectra.filter_forms import (
     FILTERS,
+    LEAST_UNDONE,
+    UNDONE,
     filter_corner,
     filter_number,
     filter_response,
@@ -19,7 +21,7 @@ from gyrofuse.mismatch.likelihoods.spectra.filter_forms import (
 )
 from gyrofuse.mismatch.likelihoods.spectra.fit import pieces
 from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios
-from gyrofuse.mismatch.likelihoods.spectra.starts import closest_starts
+from gyrofuse.mismatch.likelihoods.spectra.starts import best_start, closest_starts
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter, Rival
 from gyrofuse.mismatch.mechanisms.spectra.findings import found
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import chosen_shape, refit
@@ -40,6 +42,7 @@ class LowPassFilter(Filter):
     Attributes:
         kind: Form of the filter.
         strength: Of each sensor's, `(sensor,)`; 0 is none.
+        undone: Whether it is the simulation's, and taken off that.
     """
 
     name: ClassVar[str] = "low_pass"
@@ -48,19 +51,39 @@ class LowPassFilter(Filter):
     made_of: ClassVar[str] = "filter"
     kind: str
     strength: OfSensors
+    undone: bool = False
 
     @classmethod
     def starts(cls, data: Ratios, company: Sequence[Term]) -> Iterable[Term]:
-        if any(isinstance(term, LowPass) for term in company):
+        there = {type(term) for term in company}
+        if LowPass not in there:
+            likeliest = 3  # forms
+            yield from filter_starts(data, company)[:likeliest]
+        if SimulatedLowPass not in there and _falls(data):
+            yield from filter_starts(data, company, SimulatedLowPass)[:1]
+
+    @classmethod
+    def pairs(cls, data: Ratios, company: Sequence[Term]) -> Iterable[tuple[Term, Term]]:
+        """The simulation's filter and the recording's, of one form and other corners: their ratio is no filter."""
+        if not _falls(data) or any(isinstance(term, LowPass) for term in company):
             return ()
-        likeliest = 3  # forms
-        return filter_starts(data, company)[:likeliest]
+        beside = pieces(data, company)
+        found: list[tuple[float, tuple[Term, Term]]] = []
+        for kind in UNDONE:
+            own, grid = SimulatedLowPass.starts(data.ground, kind), LowPass.starts(data.ground, kind)
+            for number in own.local[::2]:
+                simulated = replace(own, local=number.expand(1, data.n_sensors))
+                values = simulated.values(data.ground, simulated.local, simulated.shared)
+                start, gain = best_start(data, beside.with_term("undo", values), grid)
+                if float(start.local.mean()) > float(number):  # a lower corner than the simulation's is a filter more
+                    found.append((gain, (simulated, start)))
+        return [max(found, key=lambda entry: entry[0])[1]] if found else ()
 
     @classmethod
     def forms(cls, data: Ratios, term: Term, company: Sequence[Term]) -> Iterable[Term]:
         if not isinstance(term, LowPass):
             return ()
-        return [form for form in filter_starts(data, company) if form.kind != term.kind]
+        return [form for form in filter_starts(data, company, type(term)) if form.kind != term.kind]
 
     @classmethod
     def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
@@ -68,7 +91,6 @@ class LowPassFilter(Filter):
         if shape is None or not isinstance(shape.term, LowPass):
             return None
         term, rate = shape.term, comparison.info.rate
-        strength = strengths(term)
         sensors = tuple(int(i) for i in term.free[0].nonzero()[:, 0])
         # Which form it has is not known either; digital ones need not halve the power at all.
         forms = [
@@ -87,13 +109,17 @@ class LowPassFilter(Filter):
             corners = f"half power at {min(inside):.4g} Hz"
         if inside and max(inside) > 1.02 * min(inside):
             corners = f"half power between {min(inside):.4g} and {max(inside):.4g} Hz"
+        effect = cls.of(term)
+        words = f"a low-pass filter in {where} that the simulation does not have, {corners}"
+        if effect.undone:
+            words = f"the simulation has a low-pass filter in {where} that the recording does not have, {corners}"
         return found(
             comparison,
-            cls(term.kind, strength),
+            effect,
             shape,
             sensors,
             parameters,
-            f"a low-pass filter in {where} that the simulation does not have, {corners}",
+            words,
             frequency_hz=min(inside) if inside else None,
         )
 
@@ -106,24 +132,39 @@ class LowPassFilter(Filter):
 
     @classmethod
     def from_term(cls, term: Term, comparison: Comparison) -> LowPassFilter | None:
-        return cls(term.kind, strengths(term)) if isinstance(term, LowPass) else None
+        return cls.of(term) if isinstance(term, LowPass) else None
+
+    @classmethod
+    def of(cls, term: LowPass) -> LowPassFilter:
+        """What a term stands for."""
+        return cls(term.kind, strengths(term), isinstance(term, SimulatedLowPass))
 
     def response(self, f: Tensor) -> Tensor:
-        return filter_response(self.kind, self.strength, f)
+        response = filter_response(self.kind, self.strength, f)
+        return response.conj() / response.abs().square().clamp(min=LEAST_UNDONE) if self.undone else response
 
     def fit_without(self, comparison: Comparison, fold: int) -> Mechanism:
         has = self.strength > 0
         own = torch.where(has, filter_number(self.kind, self.strength), 0.0)[None]
-        term = LowPass(own, has[None], torch.zeros(0, dtype=torch.float64), self.kind)
+        form = SimulatedLowPass if self.undone else LowPass
+        term = form(own, has[None], torch.zeros(0, dtype=torch.float64), self.kind)
         found = refit(comparison, fold, term, self.company)
         assert isinstance(found, LowPass)
         return replace(self, strength=strengths(found))
 
 
-def filter_starts(data: Ratios, company: Sequence[Term]) -> list[LowPass]:
+def filter_starts(data: Ratios, company: Sequence[Term], form: type[LowPass] = LowPass) -> list[LowPass]:
     """Every form of a filter at its likeliest corners, the likeliest first."""
-    found = closest_starts(data, pieces(data, company), [LowPass.starts(data.ground, kind) for kind in FILTERS])
+    families = [form.starts(data.ground, kind) for kind in (UNDONE if form is SimulatedLowPass else FILTERS)]
+    found = closest_starts(data, pieces(data, company), families)
     return [start for start in found if isinstance(start, LowPass)]
+
+
+def _falls(data: Ratios) -> bool:
+    """Whether the simulation's noise falls towards half the rate in some sensor, more than an AR1 does."""
+    least = 0.4  # power at 0.48 over that at 0.24 of the rate: of an AR1 0.47
+    middle, high = (data.power[int((data.ground.bands.frequency - f).abs().argmin())] for f in (0.24, 0.48))
+    return bool((high < least * middle).any())
 
 
 def strengths(term: LowPass) -> Tensor:
