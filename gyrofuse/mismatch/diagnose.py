@@ -24,7 +24,7 @@ from gyrofuse.mismatch.repair.reference_effects import with_own_effects
 from gyrofuse.mismatch.repair.repaired_model import RepairedModel
 from gyrofuse.mismatch.reporting.judge import checked_judge, judged
 from gyrofuse.mismatch.reporting.report import MismatchReport
-from gyrofuse.mismatch.selection.backward import eliminate
+from gyrofuse.mismatch.selection.backward import eliminate, nearer
 from gyrofuse.mismatch.selection.discrepancy import discrepancy_left
 from gyrofuse.mismatch.selection.forward import select
 from gyrofuse.mismatch.selection.held_out import agreement
@@ -139,6 +139,7 @@ def diagnose(
     )
     progress("alternatives", _FOUND)
     selected, comparison = eliminate(selected, comparison, level, generator)
+    selected, comparison = nearer(selected, start, comparison, generator)
     found = [one.finding for one in selected]
     findings = tuple(
         replace(f, context=Context(start, tuple(other.effect for other in found if other is not f))) for f in found

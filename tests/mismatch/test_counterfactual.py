@@ -16,7 +16,7 @@ from gyrofuse.mismatch.detectors.slow.scans import slow_analysis
 from gyrofuse.mismatch.detectors.spectra.peak_fit import Oscillation
 from gyrofuse.mismatch.detectors.spectra.peaks import Stretch
 from gyrofuse.mismatch.detectors.spectra.steadiness import Steadiness, steadiness
-from gyrofuse.mismatch.mechanisms.mechanism import Alternative, Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanisms.mechanism import Alternative, Finding, Mechanism, Parameter, repaired
 from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone, amplitude_limits, line_near
 from gyrofuse.mismatch.mechanisms.slow.late_warm_up import LateWarmUp
 from gyrofuse.mismatch.mechanisms.slow.step import Step
@@ -31,7 +31,8 @@ from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
 from gyrofuse.mismatch.reporting.text import otherwise_words
 from gyrofuse.mismatch.selection import alternatives
 from gyrofuse.mismatch.selection.alternatives import compare, rivals_of
-from gyrofuse.mismatch.selection.backward import eliminate, same_line
+from gyrofuse.mismatch.selection.backward import eliminate, nearer, same_line
+from gyrofuse.mismatch.selection.discrepancy import mean_discrepancy
 from gyrofuse.mismatch.selection.forward import Selected
 from gyrofuse.mismatch.selection.held_out import HeldOutScore, score_held_out
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
@@ -179,6 +180,21 @@ def test_what_others_make_needless_is_dropped_and_the_rest_rebuilt():
     assert link.before is start
     assert link.finding.held_out_gain == pytest.approx(true.finding.held_out_gain, rel=1e-9)
     torch.testing.assert_close(left.recording, effect.repair(start, generator(0)).recording)
+
+
+def test_what_leads_away_with_all_the_others_goes_and_the_others_stay():
+    """A tone that is there, and one that is not: with the second the simulation is farther off than it came."""
+    start = case_of(5, tone(12.34, 0.3))
+    (there,), _ = chain(start, VibrationTone)
+    effect = there.finding.effect
+    assert isinstance(effect, VibrationTone)
+    wrong = replace(effect, frequency_hz=0.7 * effect.frequency_hz, cosine=effect.cosine + 1.0)
+    links = [Selected(replace(there.finding, effect=wrong), start, score_held_out(start, wrong)), there]
+    made = repaired(start, [wrong, effect], generator(0))
+    kept, comparison = nearer(links, start, made, generator(0))
+    assert kept == [there]
+    assert mean_discrepancy(comparison) < mean_discrepancy(start) < mean_discrepancy(made)
+    assert nearer(kept, start, comparison, generator(0)) == (kept, comparison)
 
 
 def test_a_better_look_alike_takes_the_place():

@@ -15,6 +15,7 @@ import torch
 from gyrofuse.mismatch.mechanisms.catalogue import named
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, repaired
 from gyrofuse.mismatch.selection.alternatives import compare
+from gyrofuse.mismatch.selection.discrepancy import is_farther, mean_discrepancy
 from gyrofuse.mismatch.selection.forward import Selected
 from gyrofuse.mismatch.selection.held_out import HeldOutScore, score_beneath, score_held_out
 from gyrofuse.mismatch.signals.comparison import Comparison
@@ -59,6 +60,30 @@ def eliminate(
             names = set() if renamed else _names_instead([found[k].finding for k in lost])
             selected, comparison = _renamed(selected, lost, names, level, generator)
             renamed = True
+
+
+def nearer(
+    selected: list[Selected], start: Comparison, comparison: Comparison, generator: torch.Generator
+) -> tuple[list[Selected], Comparison]:
+    """Findings without those that together take the simulation away from the recording, the worst first.
+
+    Each is checked by itself beside spectral lines, which have mechanisms of their own; two of one line may undo it.
+
+    Args:
+        selected: Findings in order.
+        start: Recording and simulation as they came.
+        comparison: The same with all of them repaired.
+        generator: Source of the random numbers of what is applied to the simulation.
+    """
+    while selected and is_farther(comparison, start):
+        fewer = [[*selected[:k], *selected[k + 1 :]] for k in range(len(selected))]
+        made = [repaired(start, [one.finding.effect for one in some], generator) for some in fewer]
+        left = [mean_discrepancy(one) for one in made]
+        best = min(range(len(left)), key=left.__getitem__)
+        if not left[best] < mean_discrepancy(comparison):
+            break
+        selected, comparison = fewer[best], made[best]
+    return selected, comparison
 
 
 def same_line(first: Finding, second: Finding, comparison: Comparison) -> bool:
