@@ -18,7 +18,7 @@ from gyrofuse.mismatch.likelihoods.damped_tone import Surroundings
 from gyrofuse.mismatch.likelihoods.pulse import FittedPulse, Pulse, fitted_pulse, other_course, sized, width_limits
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
-from gyrofuse.mismatch.mechanisms.regimes.transient import Transient, hourly
+from gyrofuse.mismatch.mechanisms.regimes.transient import Transient, hourly, often_words
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.signals.folds import N_FOLDS
@@ -83,7 +83,7 @@ class Pulses(Transient):
         return Finding(
             cls.name,
             effect,
-            f"{many} of one sign and then gone, {often.value:.3g} an hour, in "
+            f"{many} of one sign and then gone{often_words(len(pulses), often)}, in "
             f"{info.named(concerned, 'all sensors')}: the strongest at {onset:.6g} s, {width:.3g} s long, of "
             f"{float(strongest.amplitude[largest]):.3g} {info.measure} in sensor {info.sensors[largest]}, as of "
             "a shock or a fault of transmission",

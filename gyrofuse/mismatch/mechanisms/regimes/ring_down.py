@@ -17,7 +17,7 @@ from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.likelihoods.damped_tone import DampedTone, FittedTone, Surroundings
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
-from gyrofuse.mismatch.mechanisms.regimes.transient import Transient, hourly
+from gyrofuse.mismatch.mechanisms.regimes.transient import Transient, hourly, often_words
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.signals.folds import N_FOLDS
@@ -109,8 +109,9 @@ class RingDown(Transient):
         return Finding(
             cls.name,
             effect,
-            f"{knocks} {'knock' if knocks == 1 else 'knocks'} after which something rings, {often.value:.3g} an "
-            f"hour, in {info.named(concerned, 'all sensors')}: the strongest at {onset:.6g} s, at {f:.4g} Hz, dies "
+            f"{knocks} {'knock' if knocks == 1 else 'knocks'} after which something rings"
+            f"{often_words(knocks, often)}, in {info.named(concerned, 'all sensors')}: the strongest at {onset:.6g} s, "
+            f"at {f:.4g} Hz, dies "
             f"away in {decay:.3g} s, from {float(amplitude[largest]):.3g} {info.measure} in sensor "
             f"{info.sensors[largest]}",
             p_value,

@@ -70,6 +70,12 @@ def hourly(count: int, duration_s: float) -> Parameter:
     return Parameter(count / hours, low, high, "1/h")
 
 
+def often_words(count: int, often: Parameter) -> str:
+    """Words of how often events come, where they are enough to say."""
+    fewest = 5
+    return f", {often.value:.3g} an hour" if count >= fewest else ""
+
+
 def kept_of(n_samples: int, fold: int) -> Tensor:
     """Samples that a fold does not hold out, `(time,)`."""
     return torch.arange(n_samples) % N_FOLDS != fold
