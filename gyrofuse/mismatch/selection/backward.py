@@ -67,7 +67,8 @@ def nearer(
 ) -> tuple[list[Selected], Comparison]:
     """Findings without those that together take the simulation away from the recording, the worst first.
 
-    Each is checked by itself beside spectral lines, which have mechanisms of their own; two of one line may undo it.
+    What changes noise was checked by itself, beside spectral lines that both sides have. Two findings of one line may
+    undo it; and no other one that leaves the noise as it is was checked.
 
     Args:
         selected: Findings in order.
@@ -76,11 +77,15 @@ def nearer(
         generator: Source of the random numbers of what is applied to the simulation.
     """
     while selected and is_farther(comparison, start):
-        fewer = [[*selected[:k], *selected[k + 1 :]] for k in range(len(selected))]
+        fewer = [
+            [*selected[:k], *selected[k + 1 :]]
+            for k, (finding, *_) in enumerate(selected)
+            if not finding.effect.changes_noise or finding.effect.line_width(finding.parameters, start)
+        ]
         made = [repaired(start, [one.finding.effect for one in some], generator) for some in fewer]
         left = [mean_discrepancy(one) for one in made]
-        best = min(range(len(left)), key=left.__getitem__)
-        if not left[best] < mean_discrepancy(comparison):
+        best = min(range(len(left)), key=left.__getitem__, default=0)
+        if not left or not left[best] < mean_discrepancy(comparison):
             break
         selected, comparison = fewer[best], made[best]
     return selected, comparison
