@@ -102,7 +102,7 @@ def handled(seed: int) -> np.ndarray:
 
 def started_anew(seed: int) -> np.ndarray:
     x = noise(seed)
-    x[1] += np.where(T >= 31.234, 0.5 * np.exp(-(T - 31.234).clip(0) / 7), 0.0)
+    x[1] += np.where(T >= 31.234, 1.2 * np.exp(-(T - 31.234).clip(0) / 7), 0.0)
     return x
 
 
@@ -171,7 +171,7 @@ CASES = {
     "started anew": Case(
         started_anew,
         ("warm_up_transient",),
-        {"warm_up_transient.onset": 31.234, "warm_up_transient.time_constant": 7.0, "warm_up_transient.size[1]": 0.5},
+        {"warm_up_transient.onset": 31.234, "warm_up_transient.time_constant": 7.0, "warm_up_transient.size[1]": 1.2},
     ),
     "shocks": Case(shocks, ("pulses",), {"pulses.width": 20 / RATE}),
     "glitches of three": Case(glitches_of_three, ("pulses",), {}),

@@ -2,8 +2,8 @@
 
 In cells of 32 to 256 samples the mean square of whitened samples is compared with the median over all cells, of single
 samples and of means over 16 of them. Handling is smooth, so that means show more of it; it is no course of the bias,
-which a cubic follows; no vibration or ringing, which has many cycles of one frequency; and it is over after a part of
-the record.
+which a cubic follows; no vibration or ringing, which has many cycles of one frequency; no shock, which is over at once;
+and it is over after a part of the record.
 """
 
 from __future__ import annotations
@@ -64,10 +64,11 @@ def _stretches(white: Tensor, signal: Tensor) -> list[Stretch]:
     found = []
     for first, end in _as_far_as_seen((power / level).mean(0), _runs(moves, fewest_cells)):
         start, stop = max(first - 1, 0) * cell, min((end + 1) * cell, means.shape[-1] * mean_of)
-        slow = _without_cubic(means[:, start // mean_of : stop // mean_of]).square().mean(-1) / level[:, 0]
+        part = means[:, start // mean_of : stop // mean_of]
+        slow = _without_cubic(part).square().mean(-1) / level[:, 0]
         fast = white[:, start:stop].square().mean(-1) / usual
         which = _that_move(slow, fast, least)
-        if bool(which.any()) and not _rings(_without_cubic(signal[which, start:stop])):
+        if bool(which.any()) and not _at_once(part.square() / level) and not _rings(signal[which, start:stop]):
             log_ratio = float((slow - 1 - slow.log())[which].sum()) * (stop - start) / mean_of / 2
             found.append(Stretch(start, stop, cell, log_ratio, which))
     return found if sum(one.end - one.first for one in found) < most * n else []
@@ -110,9 +111,17 @@ def _that_move(slow: Tensor, fast: Tensor, least: float) -> Tensor:
     return which
 
 
+def _at_once(power: Tensor) -> bool:
+    """Whether nearly all power `(sensor, mean)` is in four means, as that of a shock."""
+    mostly, few = 0.8, 4
+    total = power.sum(0)
+    return bool(total.topk(min(few, len(total))).values.sum() > mostly * total.sum())
+
+
 def _rings(signal: Tensor) -> bool:
     """Whether signals `(sensor, time)` are many cycles of one frequency at a time."""
     mostly, many, few = 0.7, 6, 3  # share of the power; cycles of the whole, and of an eighth of it
+    signal = _without_cubic(signal)
     return any(
         float(share) > mostly and cycles >= least
         for length, least in ((signal.shape[-1], many), (signal.shape[-1] // 8, few))

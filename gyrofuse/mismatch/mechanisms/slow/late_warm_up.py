@@ -75,7 +75,7 @@ class LateWarmUp(SlowEffect):
         strong = strong_scan(comparison, cls.name, level)
         if strong is None or not cls.owns(strong.scan):
             return None
-        sure = 1e-6  # p value: where noise is louder for a while, something seems to jump and decay
+        sure = 1e-5  # p value: where noise is louder for a while, something seems to jump and decay
         if strong.scan.family.decays and strong.scan.p_value > sure:
             return None
         step = strong.analysis.scan("step")
