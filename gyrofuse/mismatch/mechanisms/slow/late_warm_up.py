@@ -14,10 +14,16 @@ from torch import Tensor
 from gyrofuse.mismatch.decisions import NATS_AS_GOOD
 from gyrofuse.mismatch.detectors.slow.estimates import estimate, log_factors, only
 from gyrofuse.mismatch.detectors.slow.scans import Scan
-from gyrofuse.mismatch.likelihoods.slow_noise import ordinates
+from gyrofuse.mismatch.likelihoods.slow_noise import best_fit, ordinates
 from gyrofuse.mismatch.likelihoods.slow_templates import Family
 from gyrofuse.mismatch.mechanisms.mechanism import Finding
-from gyrofuse.mismatch.mechanisms.slow.slow_effect import SlowEffect, in_seconds, slow_finding, strong_scan
+from gyrofuse.mismatch.mechanisms.slow.slow_effect import (
+    SlowEffect,
+    Strong,
+    in_seconds,
+    slow_finding,
+    strong_scan,
+)
 from gyrofuse.mismatch.signals.comparison import N_BLOCKS, Comparison, RecordingInfo
 
 
@@ -75,8 +81,7 @@ class LateWarmUp(SlowEffect):
         strong = strong_scan(comparison, cls.name, level)
         if strong is None or not cls.owns(strong.scan):
             return None
-        sure = 1e-5  # p value: where noise is louder for a while, something seems to jump and decay
-        if strong.scan.family.decays and strong.scan.p_value > sure:
+        if strong.scan.family.decays and not _stands_alone(strong):
             return None
         step = strong.analysis.scan("step")
         if step is not None and step.gain > strong.scan.gain - NATS_AS_GOOD:  # which takes no time
@@ -109,6 +114,21 @@ class LateWarmUp(SlowEffect):
         since = info.seconds(n_samples) - self.onset_s
         decayed = (-since.clamp(min=0) / self.time_constant_s).exp()
         return torch.where(since < 0, 0.0, decayed if self.decays else 1 - decayed)[None]
+
+
+def _stands_alone(strong: Strong) -> bool:
+    """Whether a jump that decays is one, and no part of a path that jumps and decays again and again.
+
+    Where noise is louder for a while, or the device moves, something always seems to.
+    """
+    sure, much = 1e-5, 1 / 3  # p value; share of its gain
+    analysis, scan = strong.analysis, strong.scan
+    if scan.p_value > sure:
+        return False
+    left = analysis.y - scan.fit.size @ scan.design
+    families = tuple(family for family in analysis.families if family.decays)
+    again = replace(analysis, y=left, null=best_fit(analysis.noise, left), families=families).scans[0]
+    return again.gain < much * scan.gain
 
 
 def _designs(block: int, decays: bool, points: Tensor) -> Tensor:
