@@ -217,7 +217,7 @@ def handled(bench: Bench, nats: float) -> Part:
     """Somebody moves the device for a while: every axis turns, smoothly, and comes to rest again."""
     length = int(bench.n * bench.rng.uniform(0.03, 0.12))
     start = int(bench.rng.uniform(0.05, 0.95) * (bench.n - length))
-    cut = math.exp(bench.rng.uniform(math.log(6 / length), math.log(0.03)))  # cycles per sample
+    cut = math.exp(bench.rng.uniform(math.log(min(6 / length, 0.02)), math.log(0.03)))  # cycles per sample
     turns = sps.sosfiltfilt(sps.butter(2, 2 * cut, output="sos"), bench.rng.standard_normal((3, length + 8000)))
     window = sps.windows.tukey(length, 0.3)
     axes = bench.rng.standard_normal((bench.base.white.shape[0], 3))
