@@ -177,11 +177,13 @@ _REAL: dict[str, tuple[Callable[[Bench, float], Part], ...]] = {
 }
 
 _LINE = ("line", True)  # that all sensors share and the simulator knows
+_OF_RECORD = ("of_record", True)  # whatever number of sensors is drawn to have it
 _ON_THE_TABLE: dict[str, tuple[tuple[str, Any], ...]] = {
     "clock_skew": (_LINE,),
     "clock_lost_samples": (_LINE,),
-    "time_scale": (_LINE, ("of_record", True)),  # the label is the record's: no sensor has a rate of its own
+    "time_scale": (_LINE, _OF_RECORD),  # the label is the record's: no sensor has a rate of its own
 }
+_ALL_AT_ONCE: dict[str, tuple[tuple[str, Any], ...]] = {"handled": (_OF_RECORD,)}  # a device moves as a whole
 
 KINDS: dict[str, Kind] = {
     **{name: Kind("mechanism", (effect,), _ON_THE_TABLE.get(name, ())) for name, effect in _MECHANISMS.items()},
@@ -189,7 +191,7 @@ KINDS: dict[str, Kind] = {
     **{f"pair:{name}": Kind("pair", (e,), tuple(o.items())) for name, (e, o) in _PAIRS.items()},
     **{f"two:{name}": Kind("two", tuple(_MECHANISMS[part] for part in parts)) for name, parts in _COMBINED.items()},
     **{f"outside:{name}": Kind("outside", (effect,)) for name, effect in _OUTSIDE.items()},
-    **{f"form:{name}": Kind("form", (effect,)) for name, effect in _FORMS.items()},
+    **{f"form:{name}": Kind("form", (effect,), _ALL_AT_ONCE.get(name, ())) for name, effect in _FORMS.items()},
     **{f"common_noise:{law}": Kind("common_noise", (), (("law", law),)) for law in common_noise.LAWS},
     **{
         f"fitted:{name}": Kind("fitted", (), (("fit", {"model": _RIGHT, **options}),))
