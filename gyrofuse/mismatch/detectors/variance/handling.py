@@ -40,9 +40,11 @@ class Stretch(NamedTuple):
 @derived
 def handled(comparison: Comparison) -> tuple[Stretch, ...]:
     """Stretches in which the recording's device is handled, in the order of time; none where the simulation has any."""
-    if any(_stretches(whitened(record, comparison.base), record) for record in comparison.reference.signal[:2]):
+    found = _stretches(comparison.white, comparison.recording)
+    simulated = comparison.reference.signal[:2] if found else ()
+    if any(_stretches(whitened(record, comparison.base), record) for record in simulated):
         return ()
-    return tuple(_stretches(comparison.white, comparison.recording))
+    return tuple(found)
 
 
 def _stretches(white: Tensor, signal: Tensor) -> list[Stretch]:

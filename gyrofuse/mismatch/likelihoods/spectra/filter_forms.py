@@ -60,7 +60,6 @@ _SAMPLED_MEANS = {"integrated": 1, "integrated2": 2}  # analogue means in a row
 _MEANS = {"average": 1, **_SAMPLED_MEANS}
 FILTERS = ("pole", "poles", *_MEANS, *_FORMS)
 UNDONE = ("bilinear2", "sampled2", "bilinear4")  # of one pole it is what differences add
-LEAST_UNDONE = 1e-12  # of a filter's power: what is less is lost in rounding
 _HALVINGS = 60  # of an interval: double precision
 _LONGEST = 0.9999  # pole: of a time constant of 10^4 samples
 

@@ -41,11 +41,8 @@ class Transient(Mechanism):
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
         n, white = comparison.n_samples, comparison.white
         taken = whitened(self.path(n, comparison.info.rate), comparison.base)
-        gains = (white * taken - taken.square() / 2) * ~kept_of(n, fold)
-        block = n // N_JUDGED
-        of_blocks = gains[:, : N_JUDGED * block].unflatten(-1, (N_JUDGED, block)).sum(-1)
-        scores = (of_blocks / noise_along(taken, white - taken).clamp(min=1e-300)).sum(0)
-        return scores.view(N_JUDGED // N_FOLDS, N_FOLDS).sum(-1)
+        gains = held_out_sums(white * taken - taken.square() / 2, fold)
+        return in_fours((gains / noise_along(taken, white - taken).clamp(min=1e-300)).sum(0))
 
     def gained(self, comparison: Comparison, numbers: int) -> float:
         """Log likelihood ratio in sample less what so many numbers cost, nats: which course it is, it says as well."""
@@ -74,6 +71,18 @@ def often_words(count: int, often: Parameter) -> str:
     """Words of how often events come, where they are enough to say."""
     fewest = 5
     return f", {often.value:.3g} an hour" if count >= fewest else ""
+
+
+def held_out_sums(gains: Tensor, fold: int) -> Tensor:
+    """Sums of gains `(..., time)` over the samples of each block that a fold holds out, `(..., N_JUDGED)`."""
+    n = gains.shape[-1]
+    block = n // N_JUDGED
+    return (gains * ~kept_of(n, fold))[..., : N_JUDGED * block].unflatten(-1, (N_JUDGED, block)).sum(-1)
+
+
+def in_fours(scores: Tensor) -> Tensor:
+    """Scores `(N_JUDGED,)` of four blocks together, which stand for one, as every fourth sample is held out."""
+    return scores.view(N_JUDGED // N_FOLDS, N_FOLDS).sum(-1)
 
 
 def kept_of(n_samples: int, fold: int) -> Tensor:

@@ -14,10 +14,9 @@ from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.detectors.variance.handling import handled
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
-from gyrofuse.mismatch.mechanisms.regimes.transient import Transient, kept_of
+from gyrofuse.mismatch.mechanisms.regimes.transient import Transient, held_out_sums, in_fours, kept_of
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import Dims
-from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -124,14 +123,12 @@ class Motion(Transient):
         return self.fitted_to(comparison, spans, kept_of(comparison.n_samples, fold))
 
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
-        n, block = comparison.n_samples, comparison.n_samples // N_JUDGED
-        gains = torch.zeros(n, dtype=torch.float64)
-        for (first, end), louder in zip(self._spans(n, comparison.info.rate), self.louder, strict=True):
+        gains = torch.zeros(comparison.n_samples, dtype=torch.float64)
+        for (first, end), louder in zip(self._spans(len(gains), comparison.info.rate), self.louder, strict=True):
             white = comparison.white[:, first:end]
             explained = (white * torch.linalg.solve(louder, white)).sum(0)
             gains[first:end] = (white.square().sum(0) - explained - torch.logdet(louder)) / 2
-        scores = (gains * ~kept_of(n, fold))[: N_JUDGED * block].unflatten(-1, (N_JUDGED, block)).sum(-1)
-        return scores.view(N_JUDGED // N_FOLDS, N_FOLDS).sum(-1)
+        return in_fours(held_out_sums(gains, fold))
 
     def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
         first, end = self._spans(comparison.n_samples, comparison.info.rate)[0]

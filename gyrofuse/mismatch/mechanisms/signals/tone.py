@@ -81,12 +81,14 @@ class VibrationTone(Mechanism):
         if line.p_value > level:
             return None
         tone = cls.at(comparison, line.frequency * comparison.info.rate)
-        spread = tone._frequency_sd(comparison)
+        sd = tone._sd(comparison)
+        spread = tone._frequency_sd(comparison, sd)
         series = harmonics_of(comparison, tone.frequency_hz / comparison.info.rate, spread)
         if series.others:
             tone = tone.with_harmonics(comparison, series)
-            spread = tone._frequency_sd(comparison)
-        sd, squares = tone._sd(comparison), tone._squares(comparison)
+            sd = tone._sd(comparison)
+            spread = tone._frequency_sd(comparison, sd)
+        squares = tone._squares(sd)
         snr = squares[0].sqrt()
         there = included_sensors(squares[0], 2)
         seen, certain, most_told = math.sqrt(there.least), 30.0, 6  # square of a harmonic; harmonics with limits
@@ -133,26 +135,37 @@ class VibrationTone(Mechanism):
             "those above half the rate are seen folded"
         )
 
-    def _frequency_sd(self, comparison: Comparison) -> float:
-        """Standard deviation of its frequency, by the noise and a phase that walks, cycles per sample."""
+    def _frequency_sd(self, comparison: Comparison, sd: Tensor) -> float:
+        """Standard deviation of its frequency, by the noise and a phase that walks, cycles per sample.
+
+        Args:
+            comparison: Recording and simulation.
+            sd: Of the amplitudes, `(1 + harmonic, sensor)`.
+        """
+        squares = self._squares(sd)
+        present = included_sensors(squares[0], 2).which
         # Noise adds to the squares of amplitudes, but has no information on the frequency.
-        squares = (self._squares(comparison) - 2).clamp(min=0.0)
-        present = included_sensors(squares[0] + 2, 2).which
+        squares = (squares - 2).clamp(min=0.0)
         own = max(float(squares[0, present].sum()), 1.0)
         ratios = torch.tensor([h.multiple / self.multiple for h in self.harmonics], dtype=torch.float64)
         energy = own + float((ratios.square()[:, None] * squares[1:]).sum())
-        n, noise = comparison.n_samples, density_near(comparison, self.frequency_hz / comparison.info.rate)
+        n, noise = comparison.n_samples, sd[0].square() * comparison.n_samples / 2
         return math.hypot(math.sqrt(12 / energy) / (2 * math.pi * n), self.wander(comparison, noise, own))
 
     def _sd(self, comparison: Comparison) -> Tensor:
         """Standard deviation of each amplitude, `(1 + harmonic, sensor)`."""
-        densities = [density_near(comparison, f) for f in self._places(comparison.info)]
-        return (2 * torch.stack(densities) / comparison.n_samples).sqrt()
+        return (2 * self._densities(comparison) / comparison.n_samples).sqrt()
 
-    def _squares(self, comparison: Comparison) -> Tensor:
+    def _squares(self, sd: Tensor) -> Tensor:
         """Squares of amplitudes over their variances, `(1 + harmonic, sensor)`."""
         parts = torch.stack([torch.hypot(cosine, sine) for _, cosine, sine in self._parts()])
-        return (parts / self._sd(comparison)).square()
+        return (parts / sd).square()
+
+    def _densities(self, comparison: Comparison) -> Tensor:
+        """Noise of the recording around each line, without that itself, per sample `(1 + harmonic, sensor)`."""
+        reach = 64  # bins on either side
+        places = torch.tensor(self._places(comparison.info), dtype=torch.float64)
+        return squared_modulus(surroundings(comparison, places, reach)[0]).nanmean(-1).mT
 
     def _parts(self) -> list[tuple[float, Tensor, Tensor]]:
         """Its own and those of its harmonics: multiples of its frequency, cosines and sines."""
@@ -239,7 +252,7 @@ class VibrationTone(Mechanism):
         """Frequency and amplitudes by least squares on samples to keep, from where the frequency stands."""
         stretch, rate = 2**18, comparison.info.rate  # samples at a time
         ratios = torch.tensor([ratio for ratio, _, _ in self._parts()], dtype=torch.float64)
-        weights = 1 / torch.stack([density_near(comparison, f) for f in self._places(comparison.info)])
+        weights = 1 / self._densities(comparison)
         t = torch.arange(comparison.n_samples, dtype=torch.float64)[keep]
         signal = comparison.recording[:, keep]
         signal = signal - signal.mean(-1, keepdim=True)
@@ -300,13 +313,6 @@ class VibrationTone(Mechanism):
         for ratio, cosine, sine in self._parts():
             path = path + cosine[:, None] * (ratio * angle).cos() + sine[:, None] * (ratio * angle).sin()
         return path
-
-
-def density_near(comparison: Comparison, f: float) -> Tensor:
-    """Noise of the recording around a line, without the line itself, per sample `(sensor,)`."""
-    reach = 64  # bins on either side
-    beside, _ = surroundings(comparison, torch.tensor([f], dtype=torch.float64), reach)
-    return squared_modulus(beside[:, 0]).nanmean(-1)
 
 
 def line_near(comparison: Comparison, f: float, reach: float) -> float:

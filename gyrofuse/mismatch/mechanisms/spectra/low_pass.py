@@ -12,7 +12,6 @@ from torch import Tensor
 from gyrofuse.mismatch.likelihoods.spectra.components import LowPass, SimulatedLowPass, Term
 from gyrofuse.mismatch.likelihoods.spectra.filter_forms import (
     FILTERS,
-    LEAST_UNDONE,
     UNDONE,
     filter_corner,
     filter_number,
@@ -141,7 +140,8 @@ class LowPassFilter(Filter):
 
     def response(self, f: Tensor) -> Tensor:
         response = filter_response(self.kind, self.strength, f)
-        return response.conj() / response.abs().square().clamp(min=LEAST_UNDONE) if self.undone else response
+        least = 1e-12  # of its power: what is less is lost in rounding
+        return response.conj() / response.abs().square().clamp(min=least) if self.undone else response
 
     def fit_without(self, comparison: Comparison, fold: int) -> Mechanism:
         has = self.strength > 0
