@@ -197,6 +197,17 @@ def test_what_leads_away_with_all_the_others_goes_and_the_others_stay():
     assert nearer(kept, start, comparison, generator(0)) == (kept, comparison)
 
 
+def test_a_tone_stays_though_the_simulation_was_fitted_to_make_up_for_it():
+    """Power of a tone as noise of the same wavelet variances: without the tone all levels are too loud."""
+    white = gf.WhiteNoise(0.03).simulate(N, batch=(1,), generator=generator(5))
+    fitted = gf.AR1(phi=-0.45, variance=0.1)
+    simulation = fitted.simulate(N, batch=(2, 1), generator=generator(6))
+    start = Comparison.of(RecordingInfo(RATE, "deg/s", ("a",)), white + tone(35.3, 0.42)[:1], simulation)
+    (link,), made = chain(start, VibrationTone)
+    assert mean_discrepancy(made) > 1.5 * mean_discrepancy(start)
+    assert nearer([link], start, made, generator(0)) == ([link], made)
+
+
 def test_a_better_look_alike_takes_the_place():
     decay = 1.2 * torch.ones(SENSORS, 1, dtype=torch.float64) * (-torch.arange(N) / (0.15 * N)).exp()
     start = case_of(7, decay)

@@ -20,7 +20,7 @@ from gyrofuse.mismatch.likelihoods.spectra.slow_ordinates import N_SLOW, slow_ga
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.folds import N_FOLDS, seen_in_block
 from gyrofuse.mismatch.signals.known_lines import without_lines
-from gyrofuse.mismatch.signals.lines import _log_hotelling, sets_of, simulated_lines, strongest_line
+from gyrofuse.mismatch.signals.lines import log_hotelling, sets_of, simulated_lines, strongest_line
 from gyrofuse.mismatch.signals.noise_spectrum import ar1_time_constants, fit_base
 from gyrofuse.mismatch.signals.psd import bands, cross_spectra, hann_transform
 from gyrofuse.mismatch.signals.records import Records
@@ -159,7 +159,7 @@ def test_a_set_of_sensors_is_judged_by_hotelling():
     matrices = root @ root.mH + torch.eye(5)
     sets, log_chance = sets_of(5)
     m = torch.full((3, 1), 40.0, dtype=torch.float64)
-    values = _log_hotelling(z, matrices, sets, m)
+    values = log_hotelling(z, matrices, sets, m)
     for which in (0, 4, 17, 30):
         k = [i for i in range(5) if sets[which, i]]
         for c in range(3):
