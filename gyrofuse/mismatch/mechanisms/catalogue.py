@@ -33,6 +33,12 @@ from gyrofuse.mismatch.mechanisms.signals.sensor_delay import SensorDelay
 from gyrofuse.mismatch.mechanisms.signals.time_scale import TimeScale
 from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
 from gyrofuse.mismatch.mechanisms.signals.tone_amplitude import ToneSize
+from gyrofuse.mismatch.mechanisms.simulated.noise import (
+    MovedResonance,
+    SimulatedCommonMode,
+    SimulatedResonance,
+    SimulatedWanderingTone,
+)
 from gyrofuse.mismatch.mechanisms.slow.bias_oscillation import BiasOscillation
 from gyrofuse.mismatch.mechanisms.slow.late_warm_up import LateWarmUp
 from gyrofuse.mismatch.mechanisms.slow.ramp import Ramp
@@ -77,6 +83,7 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (TemperatureDrift, WarmUpTransient, LateWarmUp, Ramp, Step, BiasOscillation),
     (VarianceChange,),  # to which large jumps look alike
     (SensorDelay,),  # to which sources and modes in common would be a makeshift
+    (MovedResonance, SimulatedResonance, SimulatedWanderingTone),  # without which there are no smooth spectra
     (
         ParameterShift,
         LowPassFilter,
@@ -88,6 +95,12 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
         CommonMode,
         CrossTalk,
     ),
+    (
+        MovedResonance,
+        SimulatedResonance,
+        SimulatedWanderingTone,
+        SimulatedCommonMode,
+    ),  # whatever the recording has is known by then
 )
 
 # Stages that are searched once more after something was found in another: a course of the bias hides jumps between two

@@ -1,0 +1,1 @@
+"""What the simulation has and the recording does not."""

@@ -1,0 +1,294 @@
+"""Noise on top that only the simulation has: what would be found in it, were it the recording, is taken off it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.likelihoods.spectra.data import reference_noise
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
+from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
+from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode
+from gyrofuse.mismatch.mechanisms.spectra.resonance import Resonance
+from gyrofuse.mismatch.mechanisms.spectra.spectral import Addition, Spectral
+from gyrofuse.mismatch.mechanisms.spectra.wandering_tone import DriftingTone
+from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.derived import derived
+from gyrofuse.mismatch.signals.filters import mixed
+from gyrofuse.mismatch.signals.folds import spectral_gains
+from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+class SimulatedNoise(Spectral):
+    """`S -> M S M^H`, `M = N^1/2 (N^-1/2 (N + G) N^-1/2)^-1/2 N^-1/2`: of `N + G` the noise `N` is left.
+
+    Subclasses have the noise on top, `added`, and `own`, the recording's noise where that was found.
+    """
+
+    kind: ClassVar[type[Addition]]
+    own: NoiseSpectrum
+
+    @property
+    def noise(self) -> Addition:
+        """What is taken off."""
+        raise NotImplementedError
+
+    @classmethod
+    def around(cls, noise: Addition, own: NoiseSpectrum) -> SimulatedNoise:
+        """The mechanism that takes noise off."""
+        raise NotImplementedError
+
+    @classmethod
+    def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
+        # Where a model's numbers were estimated, what it has too much of may be their error.
+        if comparison.reference.uncertainty is not None:
+            return None
+        other = _exchanged(comparison)
+        found = cls.kind.detect_and_fit(other, level)
+        if found is None or not isinstance(found.effect, cls.kind) or not found.identified:
+            return None
+        effect = cls.around(replace(found.effect, company=()), reference_noise(other))
+        if not effect.stands_out(comparison):
+            return None
+        sentence = found.sentence.replace("that the simulation does not have", "that only the simulation has")
+        return replace(found, effect=effect, sentence=sentence)
+
+    def stands_out(self, comparison: Comparison) -> bool:
+        """Whether the simulation shows it by itself, and not only beside what the recording lacks."""
+        return True
+
+    def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
+        """Of the recording's noise over the same with what is taken off: the simulation's smooth spectrum lacks it."""
+        return spectral_gains(comparison, comparison.recording, self._after, fold, self._before)
+
+    def _after(self, matrices: Tensor, f: Tensor) -> Tensor:
+        return torch.diag_embed(self.own.spectrum(f.clamp(min=1 / self.own.n_samples)).mT).to(torch.complex128)
+
+    def _before(self, matrices: Tensor, f: Tensor) -> Tensor:
+        return self.noise.spectra(self._after(matrices, f), f)
+
+    def mixing(self, f: Tensor) -> Tensor:
+        """Complex gains `(frequency, sensor, sensor)` at `f` cycles per sample."""
+        level = self.own.spectrum(f.clamp(min=1 / self.own.n_samples)).mT.sqrt()  # (frequency, sensor)
+        both = self.noise.spectra(torch.diag_embed(level.square()).to(torch.complex128), f)
+        values, vectors = torch.linalg.eigh(both / (level[:, :, None] * level[:, None, :]))
+        root = (vectors * values.clamp(min=1e-12).rsqrt()[:, None, :]) @ vectors.mH
+        return level[:, :, None] * root / level[:, None, :]
+
+    def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
+        return mixed(signal, self.mixing)
+
+    def spectra(self, matrices: Tensor, f: Tensor) -> Tensor:
+        mixing = self.mixing(f)
+        return mixing @ matrices.to(mixing.dtype) @ mixing.mH
+
+    def factor(self, base: NoiseSpectrum, f: Tensor) -> Tensor:
+        before = torch.diag_embed(base.spectrum(f).mT).to(torch.complex128)
+        return (self.spectra(before, f) / before.diagonal(dim1=-2, dim2=-1)[:, None]).diagonal(dim1=-2, dim2=-1).real.mT
+
+    def fit_without(self, comparison: Comparison, fold: int) -> Mechanism:
+        """Its numbers are those of the simulation, of which nothing is held out."""
+        return self
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedResonance(SimulatedNoise):
+    """A mode that only the simulation has.
+
+    Attributes:
+        added: The mode.
+        own: Noise of the recording.
+    """
+
+    name: ClassVar[str] = "resonance"
+    rivals: ClassVar[tuple[str, ...]] = ("parameter_shift", "low_pass")
+    separated_by: ClassVar[str] = Resonance.separated_by
+    kind: ClassVar[type[Addition]] = Resonance
+    added: Resonance
+    own: NoiseSpectrum
+
+    @property
+    def noise(self) -> Addition:
+        return self.added
+
+    @classmethod
+    def around(cls, noise: Addition, own: NoiseSpectrum) -> SimulatedResonance:
+        assert isinstance(noise, Resonance)
+        return cls(noise, own)
+
+    def stands_out(self, comparison: Comparison) -> bool:
+        """As a bump of the simulation alone."""
+        return _bulges(comparison, self.added.mode)
+
+    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+        self.added.plot(comparison, ax, sensor=sensor, fitted=fitted)
+
+
+@dataclass(frozen=True, eq=False)
+class MovedResonance(SimulatedResonance):
+    """A mode that the simulation has at another frequency, or of another width.
+
+    Either alone leads away: what the one has at its foot stands for a part of the other.
+
+    Attributes:
+        recorded: The mode as the recording has it.
+    """
+
+    recorded: Resonance
+
+    @classmethod
+    def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
+        found = SimulatedResonance.detect_and_fit(comparison, level)
+        if found is None:
+            return None
+        assert isinstance(found.effect, SimulatedResonance)
+        old = found.effect.added.mode
+        generator = comparison.generator()
+        there = Resonance.detect_and_fit(found.effect.repair(comparison, generator), level)
+        if there is None or not isinstance(there.effect, Resonance) or not set(there.sensors) & set(found.sensors):
+            return None
+        new, nearby = there.effect.mode, 1.5
+        if not 1 / nearby < new.centre / old.centre < nearby:
+            return None
+        rate, unit = comparison.info.rate, comparison.info.measure
+        before, after = (
+            f"{mode.centre * rate:.4g} Hz (quality factor {mode.centre / mode.width / 2:.3g}, up to "
+            f"{float(mode.gain.abs().max()):.3g} {unit} rms)"
+            for mode in (old, new)
+        )
+        return replace(
+            there,
+            effect=cls(found.effect.added, found.effect.own, replace(there.effect, company=())),
+            sentence=f"the simulation's resonance at {before} is at {after} in the recording, in "
+            f"{comparison.info.named(there.sensors, 'all sensors')}",
+            p_value=max(found.p_value, there.p_value),
+            gain=found.gain + there.gain,
+        )
+
+    def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
+        return self.recorded.apply(super().apply(signal, info, generator), info, generator)
+
+    def spectra(self, matrices: Tensor, f: Tensor) -> Tensor:
+        return self.recorded.spectra(super().spectra(matrices, f), f)
+
+    def _after(self, matrices: Tensor, f: Tensor) -> Tensor:
+        return self.recorded.spectra(super()._after(matrices, f), f)
+
+    def _before(self, matrices: Tensor, f: Tensor) -> Tensor:
+        return self.noise.spectra(super()._after(matrices, f), f)
+
+    def apply_to_reference(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
+        built = super().apply_to_reference(comparison, generator)
+        mode = self.recorded.mode
+        return replace(built, modes=(*built.modes, (mode.centre, mode.width)))
+
+    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+        self.recorded.plot(comparison, ax, sensor=sensor, fitted=fitted)
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedWanderingTone(SimulatedNoise):
+    """A wandering tone that only the simulation has.
+
+    Attributes:
+        added: The tone.
+        own: Noise of the recording.
+    """
+
+    name: ClassVar[str] = "drifting_tone"
+    rivals: ClassVar[tuple[str, ...]] = ("parameter_shift",)
+    separated_by: ClassVar[str] = DriftingTone.separated_by
+    kind: ClassVar[type[Addition]] = DriftingTone
+    added: DriftingTone
+    own: NoiseSpectrum
+
+    @property
+    def noise(self) -> Addition:
+        return self.added
+
+    @classmethod
+    def around(cls, noise: Addition, own: NoiseSpectrum) -> SimulatedWanderingTone:
+        assert isinstance(noise, DriftingTone)
+        return cls(noise, own)
+
+    def stands_out(self, comparison: Comparison) -> bool:
+        """As a bump of the simulation alone."""
+        return _bulges(comparison, self.added.mode)
+
+    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+        Resonance(self.added.mode).plot(comparison, ax, sensor=sensor, fitted=fitted)
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedCommonMode(SimulatedNoise):
+    """Noise of one source in the simulation's sensors, and not in the recording's.
+
+    Attributes:
+        added: The noise.
+        own: Noise of the recording.
+    """
+
+    name: ClassVar[str] = "common_mode"
+    rivals: ClassVar[tuple[str, ...]] = ("parameter_shift",)
+    separated_by: ClassVar[str] = CommonMode.separated_by
+    kind: ClassVar[type[Addition]] = CommonMode
+    added: CommonMode
+    own: NoiseSpectrum
+
+    @property
+    def noise(self) -> Addition:
+        return self.added
+
+    @classmethod
+    def around(cls, noise: Addition, own: NoiseSpectrum) -> SimulatedCommonMode:
+        assert isinstance(noise, CommonMode)
+        return cls(noise, own)
+
+    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+        self.added.plot(comparison, ax, sensor=sensor, fitted=fitted)
+
+
+@derived
+def _exchanged(comparison: Comparison) -> Comparison:
+    """The simulation in the place of the recording, cut to the length of its records, and the other way round."""
+    simulation, recording = comparison.reference.steady, comparison.observed.steady
+    n = simulation.shape[-1]
+    count = recording.shape[-1] // n
+    records = recording[0, :, : count * n].unflatten(-1, (count, n)).movedim(1, 0)
+    info = replace(comparison.info, channels={})
+    made = Comparison.of(info, simulation[0], records)
+    varies = comparison.reference.level_variance
+    sides = (replace(side, level_variance=varies) for side in (made.observed, made.reference))
+    observed, reference = sides
+    return replace(made, as_came=observed, observed=observed, reference=reference, seed=comparison.seed)
+
+
+def _bulges(comparison: Comparison, mode: Mode) -> bool:
+    """Whether the simulation's power at a mode stands above its flanks, and the recording's hardly.
+
+    In the sensors that have it, by the logarithms. Where the recording's does as well, something acts on both; where it
+    is below, that has a hole there.
+    """
+    size, plain = mode.gain.abs() / comparison.base.spectrum(torch.tensor([mode.centre]))[:, 0].sqrt(), 0.3
+    has = size > plain * size.max()
+    simulated, recorded = (
+        _over_flanks(side.steady, mode)[has] for side in (comparison.reference, comparison.observed)
+    )
+    return 2 * abs(float(recorded.mean())) < float(simulated.mean())
+
+
+def _over_flanks(signal: Tensor, mode: Mode) -> Tensor:
+    """Logarithms of the power within a half width of a mode over that from three to six away, `(sensor,)`."""
+    n, fewest = signal.shape[-1], 4.0  # bins
+    width = max(mode.width, fewest / n)
+    power = torch.fft.rfft((signal - signal.mean(-1, keepdim=True)) * torch.hann_window(n, dtype=signal.dtype))
+    power = power.abs().square().mean(0)
+    away = (torch.arange(power.shape[-1], dtype=torch.float64) / n - mode.centre).abs() / width
+    inside, beside = away < 1, (away > 3) & (away < 6)
+    return power[:, inside].mean(-1).log() - power[:, beside].mean(-1).log()
