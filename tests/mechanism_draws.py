@@ -6,6 +6,7 @@ A new mechanism gets one function here, marked with `draws`: it gives an instanc
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -35,6 +36,12 @@ from gyrofuse.mismatch.mechanisms.signals.sensor_delay import SensorDelay
 from gyrofuse.mismatch.mechanisms.signals.time_scale import TimeScale
 from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
 from gyrofuse.mismatch.mechanisms.signals.tone_amplitude import ToneSize
+from gyrofuse.mismatch.mechanisms.simulated.noise import (
+    MovedResonance,
+    SimulatedCommonMode,
+    SimulatedResonance,
+    SimulatedWanderingTone,
+)
 from gyrofuse.mismatch.mechanisms.slow.bias_oscillation import BiasOscillation
 from gyrofuse.mismatch.mechanisms.slow.late_warm_up import LateWarmUp
 from gyrofuse.mismatch.mechanisms.slow.ramp import Ramp
@@ -59,6 +66,7 @@ from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.values.sensor_gain import SensorGain
 from gyrofuse.mismatch.mechanisms.values.stuck_samples import StuckSamples
 from gyrofuse.mismatch.mechanisms.values.unit_scale import UnitScale
+from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum
 from tests.mechanism_settings import RATE, TONE, TONE_SIZE, Drawn, Setting, draws, noise_spectrum
 
 
@@ -469,6 +477,41 @@ def _(setting: Setting) -> Drawn:
     effect = CommonMode(kind, corner, gain, noise_spectrum(setting.n_sensors, setting.n_samples), inside)
     truth = setting.of_each("gain", gain.abs()) | ({"corner": corner * RATE} if corner else {})
     return Drawn(effect, truth)
+
+
+# What only the simulation has.
+
+
+def _own(setting: Setting) -> NoiseSpectrum:
+    return noise_spectrum(setting.n_sensors, setting.n_samples)
+
+
+@draws(SimulatedResonance)
+def _(setting: Setting) -> Drawn:
+    mode = _mode(setting, 0.5, 0.6, shared=setting.chance())
+    truth = {"frequency": mode.centre * RATE, **setting.of_each("rms", mode.gain.abs())}
+    return Drawn(SimulatedResonance(Resonance(mode), _own(setting)), truth, simulated=Resonance(mode))
+
+
+@draws(MovedResonance)
+def _(setting: Setting) -> Drawn:
+    old = _mode(setting, 0.5, 0.6, shared=False)
+    new = Resonance(replace(old, centre=(1.15 if old.centre < 0.24 else 0.87) * old.centre))
+    truth = {"frequency": new.mode.centre * RATE, **setting.of_each("rms", new.mode.gain.abs())}
+    return Drawn(MovedResonance(Resonance(old), _own(setting), new), truth, simulated=Resonance(old))
+
+
+@draws(SimulatedWanderingTone)
+def _(setting: Setting) -> Drawn:
+    tone = DriftingTone(_mode(setting, 0.5, 0.6, shared=True), True)
+    return Drawn(SimulatedWanderingTone(tone, _own(setting)), {"frequency": tone.mode.centre * RATE}, simulated=tone)
+
+
+@draws(SimulatedCommonMode)
+def _(setting: Setting) -> Drawn:
+    gain = setting.signed(0.6, 0.7).to(torch.complex128) * setting.size
+    source = CommonMode("white", 0.0, gain, _own(setting), False)
+    return Drawn(SimulatedCommonMode(source, _own(setting)), setting.of_each("gain", gain.abs()), simulated=source)
 
 
 @draws(CrossTalk)

@@ -36,6 +36,7 @@ class Drawn(NamedTuple):
         channels: Auxiliary channels that it follows.
         tones: That recording and simulation have to have, cycles per sample.
         moved: Whether one motion has to move all sensors of both.
+        simulated: What the simulation has, and what the mechanism acts on.
     """
 
     effect: Mechanism
@@ -43,6 +44,7 @@ class Drawn(NamedTuple):
     channels: Mapping[str, Tensor] = {}
     tones: tuple[float, ...] = ()
     moved: bool = False
+    simulated: Mechanism | None = None
 
 
 @dataclass(frozen=True)
@@ -189,7 +191,10 @@ def concealed(kind: type[Mechanism], *seed: object, n_sensors: int = 2) -> tuple
     if drawn.moved:
         recording = recording + motion(N_SAMPLES, rng)
         simulation = simulation + motion(RECORDS * N_SAMPLES, rng)
-    recording = drawn.effect.apply(recording, info(n_sensors, drawn.channels), rng)
+    where = info(n_sensors, drawn.channels)
+    if drawn.simulated is not None:
+        recording, simulation = (drawn.simulated.apply(side, where, rng) for side in (recording, simulation))
+    recording = drawn.effect.apply(recording, where, rng)
     return (
         gf.Recording(recording, RATE, unit="deg/s", channels=drawn.channels),
         gf.Recording(simulation, RATE, unit="deg/s"),

@@ -210,6 +210,43 @@ def test_a_filter_of_the_simulation_alone_is_told_as_such(recorded: float | None
         assert abs(finding.parameters["corner[0]"].value - corner) < 1
 
 
+def ringing(seed: int, frequency: float, sd: float) -> np.ndarray:
+    """Modes of their own in all sensors, of quality factor 15."""
+    driven = np.random.default_rng(seed).standard_normal((3, N))
+    x = signal.lfilter(*signal.iirpeak(frequency, 15, fs=RATE), driven, axis=-1)
+    return sd * x / x.std()
+
+
+@pytest.mark.parametrize("seed", [1, 3])
+def test_a_resonance_of_the_simulation_alone_is_told_as_such(seed: int) -> None:
+    report = diagnosed(noise(seed), noise(seed + 1) + ringing(seed, 30.0, 0.6))
+    (finding,) = report.findings
+    assert (finding.mechanism, report.held_out.after < 2) == ("resonance", True)
+    assert "that only the simulation has" in finding.sentence
+    assert finding.parameters["frequency"].value == pytest.approx(30, abs=0.5)
+    assert finding.parameters["rms[1]"].value == pytest.approx(0.6, rel=0.2)
+
+
+@pytest.mark.parametrize("seed", [1, 3])
+def test_a_resonance_at_another_frequency_is_told_with_both(seed: int) -> None:
+    """What the one has at its foot stands for a part of the other: neither is found alone."""
+    report = diagnosed(noise(seed) + ringing(seed, 36.0, 0.8), noise(seed + 1) + ringing(seed + 1, 33.0, 0.8))
+    (finding,) = report.findings
+    assert (finding.mechanism, report.held_out.after < 2) == ("resonance", True)
+    assert finding.sentence.startswith("the simulation's resonance at 3")
+    assert finding.parameters["frequency"].value == pytest.approx(36, abs=0.5)
+
+
+@pytest.mark.parametrize("size", [0.4, 20.0])
+def test_common_noise_of_the_simulation_alone_is_told_as_such(size: float) -> None:
+    """Which is no gain of whole sensors, however much louder all of them are."""
+    source = size * np.random.default_rng(5).standard_normal(N) * np.array([[1.0], [-0.8], [0.6]])
+    report = diagnosed(noise(1), noise(2) + source)
+    assert {f.mechanism for f in report.findings} == {"common_mode"}
+    assert "that only the simulation has, with a gain of up to" in report.findings[0].sentence
+    assert report.findings[0].parameters["gain[1]"].value == pytest.approx(0.8 * size, rel=0.1)
+
+
 def test_harmonics_are_those_of_the_fundamental_frequency() -> None:
     tone = diagnosed(two_blades(1)).findings[0].effect
     assert isinstance(tone, VibrationTone)

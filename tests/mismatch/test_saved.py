@@ -7,7 +7,7 @@ import json
 import math
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass, is_dataclass, replace
 from typing import Annotated, Any, ClassVar
 
 import pytest
@@ -40,6 +40,12 @@ from gyrofuse.mismatch.mechanisms.signals.sensor_delay import SensorDelay
 from gyrofuse.mismatch.mechanisms.signals.time_scale import TimeScale
 from gyrofuse.mismatch.mechanisms.signals.tone import Harmonic, VibrationTone
 from gyrofuse.mismatch.mechanisms.signals.tone_amplitude import ToneSize
+from gyrofuse.mismatch.mechanisms.simulated.noise import (
+    MovedResonance,
+    SimulatedCommonMode,
+    SimulatedResonance,
+    SimulatedWanderingTone,
+)
 from gyrofuse.mismatch.mechanisms.slow.bias_oscillation import BiasOscillation
 from gyrofuse.mismatch.mechanisms.slow.late_warm_up import LateWarmUp
 from gyrofuse.mismatch.mechanisms.slow.ramp import Ramp
@@ -185,6 +191,10 @@ EVERY = (
     AngleQuantization(numbers(1 / 3, 0.0)),
     CrossTalk(torch.tensor([[0.0, 1 / 3], [0.05, 0.0]], dtype=torch.float64)),
     CommonMode("ar1", 0.03, complex_numbers(0.1, 0.2j), BASE, True),
+    SimulatedResonance(Resonance(MODE), BASE),
+    MovedResonance(Resonance(MODE), BASE, Resonance(replace(MODE, centre=0.3))),
+    SimulatedWanderingTone(DriftingTone(MODE, True, 0.9), BASE),
+    SimulatedCommonMode(CommonMode("white", 0.0, complex_numbers(0.1, 0.2j), BASE, False), BASE),
     DeadBand(numbers(0.0, 0.1), numbers(0.2, 0.0), numbers(0.01, 1 / 3)),
     SlowRemainder(
         numbers(0.0, 1 / 3),

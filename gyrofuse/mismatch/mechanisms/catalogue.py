@@ -83,7 +83,7 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (TemperatureDrift, WarmUpTransient, LateWarmUp, Ramp, Step, BiasOscillation),
     (VarianceChange,),  # to which large jumps look alike
     (SensorDelay,),  # to which sources and modes in common would be a makeshift
-    (MovedResonance, SimulatedResonance, SimulatedWanderingTone),  # without which there are no smooth spectra
+    (MovedResonance, SimulatedResonance, SimulatedWanderingTone, SimulatedCommonMode),  # plain in the simulation
     (
         ParameterShift,
         LowPassFilter,
@@ -95,12 +95,6 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
         CommonMode,
         CrossTalk,
     ),
-    (
-        MovedResonance,
-        SimulatedResonance,
-        SimulatedWanderingTone,
-        SimulatedCommonMode,
-    ),  # whatever the recording has is known by then
 )
 
 # Stages that are searched once more after something was found in another: a course of the bias hides jumps between two
@@ -118,10 +112,10 @@ UNNAMED: tuple[type[SlowRemainder] | type[Remainder] | type[CoherenceRemainder],
 )
 
 # Every mechanism that a repaired simulation may have; a dead band is looked for where no quantisation grid is found.
-CATALOGUE: tuple[type[Mechanism], ...] = (*itertools.chain(*STAGES), DeadBand, *UNNAMED)
+CATALOGUE: tuple[type[Mechanism], ...] = (*dict.fromkeys(itertools.chain(*STAGES)), DeadBand, *UNNAMED)
 
 
 def named(names: Iterable[str]) -> list[type[Mechanism]]:
     """Mechanisms of the stages that have one of these names, in their order; several forms may share a name."""
     wanted = frozenset(names)
-    return [kind for kind in itertools.chain(*STAGES) if kind.name in wanted]
+    return [kind for kind in dict.fromkeys(itertools.chain(*STAGES)) if kind.name in wanted]

@@ -18,7 +18,7 @@ from . import mechanics, shapes, thermal
 from .analog import OVERSAMPLING, relaxator
 from .bench import Bench, Part, quantity, rms
 from .likelihood import ar1_spectrum, comparison, divergence, folded, grid, quadratic_null, solve, spectral_llr, within
-from .spectral import added
+from .spectral import added, resonance
 from .strange import noise_of_level
 
 Array = NDArray[np.float64]
@@ -283,6 +283,29 @@ def several_modes(bench: Bench, nats: float) -> Part:
             ringing = mechanics.resonator(bench.steps, f / OVERSAMPLING, q, bench.rng)
             signal[i] += math.sqrt(size) * gains[i] * bench.sampled(ringing)
     return replace(part, signal=signal, frequency_hz=first * bench.rate, form="two modes")
+
+
+def simulated_resonance(bench: Bench, nats: float) -> Part:
+    """A structure that the simulator lets ring, and the device has not."""
+    part = resonance(bench, nats)
+    assert part.signal is not None
+    return _of_the_simulation(part, part.signal)
+
+
+def simulated_source(bench: Bench, nats: float) -> Part:
+    """White noise of one supply that the simulator has, and the device has not."""
+    sensors = bench.some_sensors(2, shared=True)
+    gains = bench.gains(sensors) * bench.sigma
+    part, size = added(bench, "common_mode", nats, gains[:, None] ** 2 * np.ones_like(bench.spectrum), broad=True)
+    return _of_the_simulation(part, math.sqrt(size) * gains[:, None] * bench.rng.standard_normal(bench.n))
+
+
+def _of_the_simulation(part: Part, path: Array) -> Part:
+    """A part that an oracle of the recording does not see."""
+    nats = part.nats
+    return replace(
+        part, signal=None, simulation=lambda simulated: simulated + path, llr=lambda recording: nats, form="simulated"
+    )
 
 
 def late_acceleration(bench: Bench, nats: float) -> Part:

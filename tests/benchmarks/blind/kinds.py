@@ -148,6 +148,8 @@ _FORMS: dict[str, Callable[[Bench, float], Part]] = {
     "level_of_channel": forms.level_of_channel,
     "several_steps": _with(shapes.step, count=3),
     "several_modes": forms.several_modes,
+    "simulated_resonance": forms.simulated_resonance,
+    "simulated_source": forms.simulated_source,
     "late_acceleration": forms.late_acceleration,
     "coloured_source": forms.coloured_source,
 }
@@ -183,7 +185,12 @@ _ON_THE_TABLE: dict[str, tuple[tuple[str, Any], ...]] = {
     "clock_lost_samples": (_LINE,),
     "time_scale": (_LINE, _OF_RECORD),  # the label is the record's: no sensor has a rate of its own
 }
-_ALL_AT_ONCE: dict[str, tuple[tuple[str, Any], ...]] = {"handled": (_OF_RECORD,)}  # a device moves as a whole
+_AS_LONG = ("share", 1.0)  # simulation, in samples
+_OF_FORMS: dict[str, tuple[tuple[str, Any], ...]] = {
+    "handled": (_OF_RECORD,),  # a device moves as a whole
+    "simulated_resonance": (_AS_LONG,),
+    "simulated_source": (_AS_LONG,),
+}
 
 KINDS: dict[str, Kind] = {
     **{name: Kind("mechanism", (effect,), _ON_THE_TABLE.get(name, ())) for name, effect in _MECHANISMS.items()},
@@ -191,7 +198,7 @@ KINDS: dict[str, Kind] = {
     **{f"pair:{name}": Kind("pair", (e,), tuple(o.items())) for name, (e, o) in _PAIRS.items()},
     **{f"two:{name}": Kind("two", tuple(_MECHANISMS[part] for part in parts)) for name, parts in _COMBINED.items()},
     **{f"outside:{name}": Kind("outside", (effect,)) for name, effect in _OUTSIDE.items()},
-    **{f"form:{name}": Kind("form", (effect,), _ALL_AT_ONCE.get(name, ())) for name, effect in _FORMS.items()},
+    **{f"form:{name}": Kind("form", (effect,), _OF_FORMS.get(name, ())) for name, effect in _FORMS.items()},
     **{f"common_noise:{law}": Kind("common_noise", (), (("law", law),)) for law in common_noise.LAWS},
     **{
         f"fitted:{name}": Kind("fitted", (), (("fit", {"model": _RIGHT, **options}),))

@@ -15,13 +15,14 @@ from torch import Tensor
 
 from gyrofuse.mismatch.detectors.lines.line_signs import line_signs
 from gyrofuse.mismatch.detectors.spectra.delays import phases_of
-from gyrofuse.mismatch.likelihoods.spectra.data import block_spectra, reference_noise
+from gyrofuse.mismatch.likelihoods.spectra.data import block_spectra, reference_noise, shared_ordinates
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED
 from gyrofuse.mismatch.stats.multiplicity import sidak
 
 _SURE = 5.0  # standard deviations of a logarithm
+_SHARED = 100.0  # ordinates that show what is shared
 
 
 class SensorGains(NamedTuple):
@@ -63,9 +64,13 @@ def sensor_gains(comparison: Comparison) -> SensorGains | None:
     z = (middle.abs() / sd).clamp(max=37.0)  # beyond, a normal tail is zero
     fitted, coarse = comparison.reference.uncertainty is not None, 0.2  # numbers of a fit are off by so much
     gained = (z > _SURE) & (middle.abs() > coarse * fitted) & _flat(levels, middle) & _lasting(comparison, middle)
+    there, seen = shared_ordinates(comparison)
+    coherent = (there < _SHARED) | (seen > there / 2)  # no gain changes a coherence
     if bool(gained.any()):
         gained &= _of_all_parts(comparison, levels, middle) | _of_what_is_shared(comparison, middle)
+        gained &= coherent
     sign, p_sign = _signs(comparison)
+    sign = torch.where(coherent, sign, 1.0)
     if not bool(gained.any()) and bool((sign > 0).all()):
         return None
     tails = torch.special.erfc(z / math.sqrt(2))[gained].tolist()
@@ -125,7 +130,7 @@ def _of_all_parts(comparison: Comparison, levels: _Levels, middle: Tensor) -> Te
 
 def _of_what_is_shared(comparison: Comparison, middle: Tensor) -> Tensor:
     """Whether what a sensor shares with others has its gain as well, `(sensor,)`, which noise of its own leaves."""
-    fewest, near = 100.0, 0.3  # ordinates that show what is shared; of the difference that the gain makes
+    near = 0.3  # of the difference that the gain makes
     both, gain = block_spectra(comparison), middle.exp()
     own, d = both.observed.mean(torch.ones(N_JUDGED, dtype=torch.bool))
     simulated, s = both.reference.mean(torch.ones(N_FOLDS, dtype=torch.bool))
@@ -135,7 +140,7 @@ def _of_what_is_shared(comparison: Comparison, middle: Tensor) -> Tensor:
     before = simulated * scale
     seen = (weight * (own * scale * before.conj()).real).sum(0)  # (sensor, sensor)
     there = (weight * (before.abs().square() - 1 / s.clamp(min=1.0)[:, None, None])).sum(0)
-    known = there.sum(-1) > fewest
+    known = there.sum(-1) > _SHARED
     ratio = (seen / gain).sum(-1) / there.sum(-1).clamp(min=1e-9)
     sd = gain / there.sum(-1).clamp(min=1e-9).sqrt()
     return known & ((ratio - 1).abs() > _SURE * sd) & ((ratio - gain).abs() < near * (gain - 1).abs())

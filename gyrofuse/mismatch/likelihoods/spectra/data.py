@@ -21,7 +21,7 @@ from torch import Tensor
 
 from gyrofuse._base.transforms import cosine_ordinates
 from gyrofuse.mismatch.decisions import CERTAIN
-from gyrofuse.mismatch.likelihoods.spectra.coherence import smooth_coherence
+from gyrofuse.mismatch.likelihoods.spectra.coherence import coherence_of, smooth_coherence
 from gyrofuse.mismatch.likelihoods.spectra.noise_parts import Ground
 from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios, exact
 from gyrofuse.mismatch.signals.comparison import Comparison
@@ -142,6 +142,27 @@ def reference_noise(comparison: Comparison) -> NoiseSpectrum:
     both = block_spectra(comparison)
     matrices, s = both.reference.mean(torch.ones(N_FOLDS, dtype=torch.bool))
     return fit_base(matrices.diagonal(dim1=-2, dim2=-1).real.mT, both.bands, comparison.n_samples, s)
+
+
+def shared_ordinates(comparison: Comparison) -> tuple[Tensor, Tensor]:
+    """Complex ordinates that a sensor shares with the others, in the simulation and in the recording, `(sensor,)`.
+
+    By squared coherences, less what chance gives them, as if both sides told equally much.
+    """
+    both, apart = block_spectra(comparison), 1 - torch.eye(comparison.n_sensors, dtype=torch.float64)
+    sides = (
+        both.reference.mean(torch.ones(N_FOLDS, dtype=torch.bool)),
+        both.observed.mean(torch.ones(N_JUDGED, dtype=torch.bool)),
+    )
+    told = 1 / torch.stack([1 / d.clamp(min=1e-9) for _, d in sides]).sum(0)
+    simulated, recorded = (
+        (
+            (told[:, None, None] * apart)
+            * (coherence_of(matrices).abs().square() - 1 / d.clamp(min=1.0)[:, None, None])
+        ).sum((0, -1))
+        for matrices, d in sides
+    )
+    return simulated, recorded
 
 
 def ratios(

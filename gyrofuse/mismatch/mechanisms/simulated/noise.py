@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.likelihoods.spectra.data import reference_noise
+from gyrofuse.mismatch.likelihoods.spectra.data import reference_noise, shared_ordinates
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
 from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
 from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode
@@ -61,7 +61,7 @@ class SimulatedNoise(Spectral):
 
     def stands_out(self, comparison: Comparison) -> bool:
         """Whether the simulation shows it by itself, and not only beside what the recording lacks."""
-        return True
+        raise NotImplementedError
 
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
         """Of the recording's noise over the same with what is taken off: the simulation's smooth spectrum lacks it."""
@@ -229,13 +229,14 @@ class SimulatedWanderingTone(SimulatedNoise):
 class SimulatedCommonMode(SimulatedNoise):
     """Noise of one source in the simulation's sensors, and not in the recording's.
 
+    Other numbers leave what sensors share as it is, in units of their powers.
+
     Attributes:
         added: The noise.
         own: Noise of the recording.
     """
 
     name: ClassVar[str] = "common_mode"
-    rivals: ClassVar[tuple[str, ...]] = ("parameter_shift",)
     separated_by: ClassVar[str] = CommonMode.separated_by
     kind: ClassVar[type[Addition]] = CommonMode
     added: CommonMode
@@ -249,6 +250,12 @@ class SimulatedCommonMode(SimulatedNoise):
     def around(cls, noise: Addition, own: NoiseSpectrum) -> SimulatedCommonMode:
         assert isinstance(noise, CommonMode)
         return cls(noise, own)
+
+    def stands_out(self, comparison: Comparison) -> bool:
+        """As what the simulation's sensors share alone."""
+        simulated, recorded = shared_ordinates(comparison)
+        has = self.added.gain != 0
+        return 2 * float(recorded[has].sum()) < float(simulated[has].sum())
 
     def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
         self.added.plot(comparison, ax, sensor=sensor, fitted=fitted)
@@ -277,9 +284,7 @@ def _bulges(comparison: Comparison, mode: Mode) -> bool:
     """
     size, plain = mode.gain.abs() / comparison.base.spectrum(torch.tensor([mode.centre]))[:, 0].sqrt(), 0.3
     has = size > plain * size.max()
-    simulated, recorded = (
-        _over_flanks(side.steady, mode)[has] for side in (comparison.reference, comparison.observed)
-    )
+    simulated, recorded = (_over_flanks(side.steady, mode)[has] for side in (comparison.reference, comparison.observed))
     return 2 * abs(float(recorded.mean())) < float(simulated.mean())
 
 

@@ -51,7 +51,8 @@ class Mode:
 
         A line under a light taper is 0.45 of a bin wide, half width.
         """
-        width = torch.tensor(math.hypot(self.width, 0.45 * resolution), dtype=torch.float64)
+        narrowest = 1e-9  # of a line, which has no density
+        width = torch.tensor(max(math.hypot(self.width, 0.45 * resolution), narrowest), dtype=torch.float64)
         return oscillation(f, torch.tensor(self.centre, dtype=torch.float64), width)
 
     def matrix(self) -> Tensor:
