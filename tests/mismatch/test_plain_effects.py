@@ -227,13 +227,14 @@ def test_a_resonance_of_the_simulation_alone_is_told_as_such(seed: int) -> None:
     assert finding.parameters["rms[1]"].value == pytest.approx(0.6, rel=0.2)
 
 
-@pytest.mark.parametrize("seed", [1, 3])
+@pytest.mark.parametrize("seed", [1, 5])
 def test_a_resonance_at_another_frequency_is_told_with_both(seed: int) -> None:
     """What the one has at its foot stands for a part of the other: neither is found alone."""
     report = diagnosed(noise(seed) + ringing(seed, 36.0, 0.8), noise(seed + 1) + ringing(seed + 1, 33.0, 0.8))
     (finding,) = report.findings
     assert (finding.mechanism, report.held_out.after < 2) == ("resonance", True)
-    assert finding.sentence.startswith("the simulation's resonance at 3")
+    said = finding.sentence.removeprefix("the simulation's resonance at ").split()
+    assert (float(said[0]), float(said[7])) == (pytest.approx(33, abs=0.5), pytest.approx(0.8, rel=0.2))
     assert finding.parameters["frequency"].value == pytest.approx(36, abs=0.5)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
@@ -158,9 +159,9 @@ class MovedResonance(SimulatedResonance):
             return None
         rate, unit = comparison.info.rate, comparison.info.measure
         before, after = (
-            f"{mode.centre * rate:.4g} Hz (quality factor {mode.centre / mode.width / 2:.3g}, up to "
-            f"{float(mode.gain.abs().max()):.3g} {unit} rms)"
-            for mode in (old, new)
+            f"{mode.centre * rate:.4g} Hz (quality factor {mode.centre / mode.width / 2:.3g}, "
+            f"up to {size:.3g} {unit} rms)"
+            for mode, size in ((old, _rms(comparison.reference.steady, old)), (new, float(new.gain.abs().max())))
         )
         return replace(
             there,
@@ -290,10 +291,25 @@ def _bulges(comparison: Comparison, mode: Mode) -> bool:
 
 def _over_flanks(signal: Tensor, mode: Mode) -> Tensor:
     """Logarithms of the power within a half width of a mode over that from three to six away, `(sensor,)`."""
+    _, power, inside, beside = _near(signal, mode)
+    return power[:, inside].mean(-1).log() - power[:, beside].mean(-1).log()
+
+
+def _rms(signal: Tensor, mode: Mode) -> float:
+    """Of the loudest sensor at a mode, by how much its power stands above the flanks."""
+    f, power, inside, beside = _near(signal, mode)
+    profile = mode.profile(f)
+    above = power[:, inside].mean(-1) - power[:, beside].mean(-1)
+    return math.sqrt(max(float(above.max() / (profile[inside].mean() - profile[beside].mean())), 0.0))
+
+
+def _near(signal: Tensor, mode: Mode) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Frequencies `(bin,)`, mean densities of records `(sensor, bin)`, bins within a half width, and on the flanks."""
     n, fewest = signal.shape[-1], 4.0  # bins
     width = max(mode.width, fewest / n)
-    power = torch.fft.rfft((signal - signal.mean(-1, keepdim=True)) * torch.hann_window(n, dtype=signal.dtype))
-    power = power.abs().square().mean(0)
-    away = (torch.arange(power.shape[-1], dtype=torch.float64) / n - mode.centre).abs() / width
-    inside, beside = away < 1, (away > 3) & (away < 6)
-    return power[:, inside].mean(-1).log() - power[:, beside].mean(-1).log()
+    taper = torch.hann_window(n, dtype=signal.dtype)
+    transform = torch.fft.rfft((signal - signal.mean(-1, keepdim=True)) * taper)
+    f = torch.arange(transform.shape[-1], dtype=torch.float64) / n
+    away = (f - mode.centre).abs() / width
+    power = transform.abs().square().mean(0) / taper.square().sum()
+    return f, power, away < 1, (away > 3) & (away < 6)
