@@ -49,15 +49,16 @@ from gyrofuse.mismatch.mechanisms.slow.slow_remainder import SlowRemainder
 from gyrofuse.mismatch.mechanisms.slow.step import Step
 from gyrofuse.mismatch.mechanisms.slow.temperature import TemperatureDrift
 from gyrofuse.mismatch.mechanisms.slow.warm_up import Decay, WarmUpTransient
+from gyrofuse.mismatch.mechanisms.spectra.bumps.oscillation import Mode
+from gyrofuse.mismatch.mechanisms.spectra.bumps.resonance import Resonance
+from gyrofuse.mismatch.mechanisms.spectra.bumps.wandering_harmonics import WanderingHarmonics
+from gyrofuse.mismatch.mechanisms.spectra.bumps.wandering_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
 from gyrofuse.mismatch.mechanisms.spectra.cross_talk import CrossTalk
 from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.notch import NotchFilter
-from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode
 from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
-from gyrofuse.mismatch.mechanisms.spectra.resonance import Resonance
-from gyrofuse.mismatch.mechanisms.spectra.wandering_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.values.angle_quantization import AngleQuantization
 from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
@@ -452,6 +453,14 @@ def _(setting: Setting) -> Drawn:
     mode = _mode(setting, 0.3, 0.4, shared=True)
     truth = {"frequency": mode.centre * RATE, **setting.of_each("amplitude", math.sqrt(2) * mode.gain.abs())}
     return Drawn(DriftingTone(mode, setting.chance()), truth)
+
+
+@draws(WanderingHarmonics)
+def _(setting: Setting) -> Drawn:
+    mode = replace(_mode(setting, 1.5, 2.0, shared=True), centre=setting.even(0.06, 0.14))
+    second, third = (replace(mode, centre=k * mode.centre, width=k * mode.width, gain=0.7 * mode.gain) for k in (2, 3))
+    effect = WanderingHarmonics(mode, True, multiples=(2, 3), others=(second, third))
+    return Drawn(effect, {"frequency": mode.centre * RATE})
 
 
 @draws(AngleQuantization)

@@ -14,13 +14,13 @@ from gyrofuse.mismatch.likelihoods.spectra.components import (
 )
 from gyrofuse.mismatch.likelihoods.spectra.filter_forms import filter_response, filter_strength
 from gyrofuse.mismatch.mechanisms.mechanism import Finding
+from gyrofuse.mismatch.mechanisms.spectra.bumps.oscillation import Mode
+from gyrofuse.mismatch.mechanisms.spectra.bumps.resonance import Resonance
+from gyrofuse.mismatch.mechanisms.spectra.bumps.wandering_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
 from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter
-from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode
 from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
-from gyrofuse.mismatch.mechanisms.spectra.resonance import Resonance
-from gyrofuse.mismatch.mechanisms.spectra.wandering_tone import DriftingTone
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.filters import filtered, noise
 from gyrofuse.noise.array_model import ArrayModel

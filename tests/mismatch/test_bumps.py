@@ -19,9 +19,9 @@ from gyrofuse.mismatch.detectors.spectra.steadiness import steadiness
 from gyrofuse.mismatch.likelihoods.spectra.common_sources import CommonBump
 from gyrofuse.mismatch.likelihoods.spectra.components import oscillation
 from gyrofuse.mismatch.likelihoods.spectra.fit import fit, pieces, slopes_of_spectra
+from gyrofuse.mismatch.mechanisms.spectra.bumps.oscillation import Mode, _momentary, _seen, excess_along, wandering_sd
+from gyrofuse.mismatch.mechanisms.spectra.bumps.resonance import Resonance
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import compared
-from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode, _momentary, _seen, excess_along, wandering_sd
-from gyrofuse.mismatch.mechanisms.spectra.resonance import Resonance
 from gyrofuse.mismatch.signals.filters import noise
 from gyrofuse.mismatch.signals.lines import whitened
 

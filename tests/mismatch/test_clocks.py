@@ -15,8 +15,8 @@ from gyrofuse.mismatch.detectors.lines.clocks import clock_test, strongest_slip
 from gyrofuse.mismatch.detectors.lines.demodulation import BLOCKS, best_slope, demodulated
 from gyrofuse.mismatch.detectors.spectra.band_tests import line_test
 from gyrofuse.mismatch.mechanisms.signals.clock import ClockSkew
-from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode
-from gyrofuse.mismatch.mechanisms.spectra.resonance import Resonance
+from gyrofuse.mismatch.mechanisms.spectra.bumps.oscillation import Mode
+from gyrofuse.mismatch.mechanisms.spectra.bumps.resonance import Resonance
 from gyrofuse.mismatch.selection.held_out import score_held_out
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.filters import resampled

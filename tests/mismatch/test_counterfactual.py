@@ -21,12 +21,12 @@ from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone, amplitude_l
 from gyrofuse.mismatch.mechanisms.slow.late_warm_up import LateWarmUp
 from gyrofuse.mismatch.mechanisms.slow.step import Step
 from gyrofuse.mismatch.mechanisms.slow.warm_up import WarmUpTransient
+from gyrofuse.mismatch.mechanisms.spectra.bumps.oscillation import Mode, wandering_sd
+from gyrofuse.mismatch.mechanisms.spectra.bumps.resonance import Resonance
+from gyrofuse.mismatch.mechanisms.spectra.bumps.wandering_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
 from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
-from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode, wandering_sd
 from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
-from gyrofuse.mismatch.mechanisms.spectra.resonance import Resonance
-from gyrofuse.mismatch.mechanisms.spectra.wandering_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
 from gyrofuse.mismatch.reporting.text import otherwise_words
 from gyrofuse.mismatch.selection import alternatives

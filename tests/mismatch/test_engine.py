@@ -13,9 +13,9 @@ from scipy import stats
 
 import gyrofuse as gf
 from gyrofuse.mismatch import MismatchReport, diagnose, discrepancy
+from gyrofuse.mismatch.mechanisms.spectra.bumps.oscillation import Mode
+from gyrofuse.mismatch.mechanisms.spectra.bumps.resonance import Resonance
 from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter
-from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode
-from gyrofuse.mismatch.mechanisms.spectra.resonance import Resonance
 from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.values.unit_scale import UnitScale
 from gyrofuse.mismatch.repair.inputs import prepared

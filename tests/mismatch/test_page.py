@@ -17,7 +17,7 @@ import gyrofuse as gf
 from gyrofuse.mismatch import Finding, MismatchReport
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.mechanisms.mechanism import Parameter
-from gyrofuse.mismatch.mechanisms.spectra.wandering_tone import DriftingTone
+from gyrofuse.mismatch.mechanisms.spectra.bumps.wandering_tone import DriftingTone
 from gyrofuse.mismatch.repair.inputs import prepared
 from gyrofuse.mismatch.reporting import text as telling
 from gyrofuse.mismatch.reporting.figures_data import compared_powers, compared_variances, grouped_spectrum

@@ -94,6 +94,15 @@ def two_blades(seed: int) -> np.ndarray:
     return noise(seed) + sum(size * np.cos(2 * math.pi * k * 8.4321 * T + k) for k, size in parts)
 
 
+def rotor(seed: int) -> np.ndarray:
+    """Speed that wanders by a few hundredths of a hertz, and lines at one, two and three times it."""
+    steps = np.random.default_rng(seed).standard_normal(N)
+    f = 17.3 + 0.2 * signal.lfilter([math.sqrt(1 - 0.9995**2)], [1, -0.9995], steps)
+    phase = 2 * math.pi * np.cumsum(f) / RATE
+    lines = sum(size * np.cos(k * phase + k) for k, size in ((1, 1.0), (2, 0.6), (4, 0.3)))
+    return noise(seed) + np.array([[1.0], [-0.6], [0.4]]) * lines
+
+
 def handled(seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     turns = signal.sosfilt(signal.butter(2, [0.5, 4], "band", fs=RATE, output="sos"), rng.standard_normal((3, N)))
@@ -167,6 +176,7 @@ CASES = {
         ("vibration_tone",),
         {"vibration_tone.frequency": 2 * 8.4321, "vibration_tone.amplitude[1]": 0.7},
     ),
+    "rotor": Case(rotor, ("drifting_tone",), {"drifting_tone.harmonic_2[0]": 0.6, "drifting_tone.harmonic_4[0]": 0.3}),
     "handled": Case(handled, ("motion",), {}),
     "started anew": Case(
         started_anew,

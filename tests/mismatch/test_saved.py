@@ -53,15 +53,16 @@ from gyrofuse.mismatch.mechanisms.slow.slow_remainder import SlowRemainder
 from gyrofuse.mismatch.mechanisms.slow.step import Step
 from gyrofuse.mismatch.mechanisms.slow.temperature import TemperatureDrift
 from gyrofuse.mismatch.mechanisms.slow.warm_up import Decay, WarmUpTransient
+from gyrofuse.mismatch.mechanisms.spectra.bumps.oscillation import Mode
+from gyrofuse.mismatch.mechanisms.spectra.bumps.resonance import Resonance
+from gyrofuse.mismatch.mechanisms.spectra.bumps.wandering_harmonics import WanderingHarmonics
+from gyrofuse.mismatch.mechanisms.spectra.bumps.wandering_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
 from gyrofuse.mismatch.mechanisms.spectra.cross_talk import CrossTalk
 from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.notch import NotchFilter
-from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode
 from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
-from gyrofuse.mismatch.mechanisms.spectra.resonance import Resonance
-from gyrofuse.mismatch.mechanisms.spectra.wandering_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.values.angle_quantization import AngleQuantization
 from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
@@ -187,6 +188,7 @@ EVERY = (
     NotchFilter(0.11, 1 / 3, numbers(0.7, 0.0)),
     Resonance(MODE),
     DriftingTone(MODE, True, 0.9),
+    WanderingHarmonics(MODE, True, 0.9, 2, (1, 3), (replace(MODE, centre=0.055), replace(MODE, centre=0.165))),
     FlickerNoise(numbers(1 / 3, 0.0)),
     AngleQuantization(numbers(1 / 3, 0.0)),
     CrossTalk(torch.tensor([[0.0, 1 / 3], [0.05, 0.0]], dtype=torch.float64)),

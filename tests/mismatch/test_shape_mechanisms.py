@@ -27,13 +27,13 @@ from gyrofuse.mismatch.detectors.spectra.pooled_coherence import common_source_t
 from gyrofuse.mismatch.detectors.spectra.shape_scan import shape_test
 from gyrofuse.mismatch.likelihoods.spectra.filter_forms import filter_response, filter_strength
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
+from gyrofuse.mismatch.mechanisms.spectra.bumps.oscillation import Mode
+from gyrofuse.mismatch.mechanisms.spectra.bumps.resonance import Resonance
+from gyrofuse.mismatch.mechanisms.spectra.bumps.wandering_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
 from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter
-from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode
 from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
-from gyrofuse.mismatch.mechanisms.spectra.resonance import Resonance
-from gyrofuse.mismatch.mechanisms.spectra.wandering_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.values.unit_scale import GRAVITY, UnitScale
 from gyrofuse.mismatch.selection.held_out import score_held_out
 from gyrofuse.mismatch.signals.filters import filtered, noise

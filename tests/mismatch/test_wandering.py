@@ -13,8 +13,8 @@ from shape_draws import SIGNS, N, array, comparison, generator, oscillating
 from gyrofuse.mismatch.detectors.spectra.frequency_courses import _cell, _courses, _hump, wandering_log_ratio
 from gyrofuse.mismatch.detectors.spectra.peak_fit import oscillation_of
 from gyrofuse.mismatch.detectors.spectra.steadiness import steadiness
-from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode
-from gyrofuse.mismatch.mechanisms.spectra.wandering_tone import DriftingTone
+from gyrofuse.mismatch.mechanisms.spectra.bumps.oscillation import Mode
+from gyrofuse.mismatch.mechanisms.spectra.bumps.wandering_tone import DriftingTone
 
 WIDTH, RMS = 60 / N, 9e-4  # half width in cycles per sample; deg/s
 

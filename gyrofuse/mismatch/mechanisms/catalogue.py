@@ -46,14 +46,15 @@ from gyrofuse.mismatch.mechanisms.slow.slow_remainder import SlowRemainder
 from gyrofuse.mismatch.mechanisms.slow.step import Step
 from gyrofuse.mismatch.mechanisms.slow.temperature import TemperatureDrift
 from gyrofuse.mismatch.mechanisms.slow.warm_up import WarmUpTransient
+from gyrofuse.mismatch.mechanisms.spectra.bumps.resonance import Resonance
+from gyrofuse.mismatch.mechanisms.spectra.bumps.wandering_harmonics import WanderingHarmonics
+from gyrofuse.mismatch.mechanisms.spectra.bumps.wandering_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
 from gyrofuse.mismatch.mechanisms.spectra.cross_talk import CrossTalk
 from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.notch import NotchFilter
 from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
-from gyrofuse.mismatch.mechanisms.spectra.resonance import Resonance
-from gyrofuse.mismatch.mechanisms.spectra.wandering_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.values.angle_quantization import AngleQuantization
 from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
@@ -77,6 +78,7 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (Motion,),  # whose smooth course looks like any of these
     (Chirp,),  # which passes any frequency
     (RingDown, Pulses),  # whose strongest are lines too
+    (WanderingHarmonics,),  # each of whose lines alone looks like several tones, or like noise that changes
     (VibrationTone, ToneInSpells, ToneSize, Interleaving),
     (RandomTelegraph,),
     (ChannelNoise, GradualChange),  # where noise is louder, what is slow is known less well

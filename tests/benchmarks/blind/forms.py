@@ -142,6 +142,28 @@ def harmonics(bench: Bench, nats: float) -> Part:
     return replace(part, form="harmonics")
 
 
+def rotor(bench: Bench, nats: float) -> Part:
+    """A rotor out of true whose speed wanders: lines in step at several multiples. Nats: of the spectra alone."""
+    sensors = bench.some_sensors()
+    f = bench.rng.uniform(0.05, 0.11) * bench.rate
+    wander, seconds = bench.rng.uniform(5, 60) / bench.duration, bench.duration / bench.rng.uniform(5, 20)
+    phase = mechanics.rotor_phase(
+        bench.steps, f / bench.step_rate, wander / bench.step_rate, seconds * bench.step_rate, bench.rng
+    )
+    unit, power = np.zeros((bench.n_sensors, bench.n)), np.zeros((bench.n_sensors, len(bench.spectrum.T)))
+    course = np.diff(phase) * bench.step_rate / (2 * np.pi) / bench.rate
+    edges = (np.arange(bench.n) + 0.5) / (2 * bench.n)
+    for k in range(1, 5):
+        share = np.convolve(np.histogram(k * course, bins=edges)[0] / len(course), [0.1, 0.2, 0.4, 0.2, 0.1], "same")
+        for i in sensors:
+            size = bench.rng.uniform(0.5, 1.5) / k
+            wave = size * bench.sampled(np.cos(k * phase[: bench.steps] + bench.rng.uniform(0, 2 * np.pi)))
+            unit[i] += wave
+            power[i] += np.sum(wave**2) * share
+    part, size = added(bench, "drifting_tone", nats, power)
+    return replace(part, signal=math.sqrt(size) * unit, look_alikes=("vibration_tone", "resonance"), form="rotor")
+
+
 def bursts_of_a_tone(bench: Bench, nats: float) -> Part:
     """A rotor that is switched on for some stretches of the record."""
     sensors = bench.some_sensors()

@@ -136,6 +136,7 @@ _FORMS: dict[str, Callable[[Bench, float], Part]] = {
     "filter": forms.low_pass,
     "average": _with(forms.low_pass, design="average"),
     "harmonics": forms.harmonics,
+    "rotor": forms.rotor,
     "bursts_of_a_tone": forms.bursts_of_a_tone,
     "curved_temperature": forms.curved_temperature,
     "two_time_constants": forms.two_time_constants,

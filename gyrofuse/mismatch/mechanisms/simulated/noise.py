@@ -11,11 +11,11 @@ from torch import Tensor
 
 from gyrofuse.mismatch.likelihoods.spectra.data import reference_noise, shared_ordinates
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
+from gyrofuse.mismatch.mechanisms.spectra.bumps.oscillation import Mode
+from gyrofuse.mismatch.mechanisms.spectra.bumps.resonance import Resonance
+from gyrofuse.mismatch.mechanisms.spectra.bumps.wandering_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
-from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode
-from gyrofuse.mismatch.mechanisms.spectra.resonance import Resonance
 from gyrofuse.mismatch.mechanisms.spectra.spectral import Addition, Spectral
-from gyrofuse.mismatch.mechanisms.spectra.wandering_tone import DriftingTone
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.filters import mixed

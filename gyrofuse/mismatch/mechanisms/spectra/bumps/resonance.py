@@ -16,7 +16,7 @@ from gyrofuse.mismatch.likelihoods.spectra.starts import peak_starts
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter, Rival
 from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
-from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode, OscillationOnTop, nominated, refitted_mode
+from gyrofuse.mismatch.mechanisms.spectra.bumps.oscillation import Mode, OscillationOnTop, nominated, refitted_mode
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.filters import noise, of_phase
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from gyrofuse.mismatch.detectors.spectra.frequency_courses import probably_normal, rampless_transform
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
-from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode, OscillationOnTop, nominated, refitted_mode
+from gyrofuse.mismatch.mechanisms.spectra.bumps.oscillation import Mode, OscillationOnTop, nominated, refitted_mode
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.psd import drawn_towards
 from gyrofuse.noise.processes.ar1_recursion import ar1_recursion
@@ -82,8 +82,20 @@ class DriftingTone(OscillationOnTop):
         track = _loudest(comparison, sensor, band, window) if fitted else None
         pictures.spectrogram(ax, comparison, sensor, band, window, track)
 
+    @property
+    def modes(self) -> tuple[Mode, ...]:
+        """Its line, and others in step with it."""
+        return (self.mode,)
+
+    @property
+    def turns(self) -> tuple[float, ...]:
+        """By how many times its phase each of them turns."""
+        return (1.0,)
+
     def density(self, f: Tensor) -> Tensor:
-        return self.mode.matrix() * self.mode.profile(f, 2 * float(f[1] - f[0]))[:, None, None]
+        resolution = 2 * float(f[1] - f[0])
+        parts = [mode.matrix() * mode.profile(f, resolution)[:, None, None] for mode in self.modes]
+        return torch.stack(parts).sum(0)
 
     def path(self, n_samples: int, generator: torch.Generator) -> Tensor:
         width = self.mode.width
@@ -95,14 +107,26 @@ class DriftingTone(OscillationOnTop):
         steps[1:] *= math.sqrt(1 - phi**2)
         turn = 2 * math.pi * torch.rand((), generator=generator, dtype=torch.float64)
         phase = 2 * math.pi * (self.mode.centre + _wandered(steps, phi)).cumsum(0) + turn
-        angle = self.mode.gain.angle()[:, None] + phase
-        return math.sqrt(2 * self.share) * self.mode.gain.abs()[:, None] * angle.cos()
+        parts = [
+            mode.gain.abs()[:, None] * (mode.gain.angle()[:, None] + times * phase).cos()
+            for mode, times in zip(self.modes, self.turns, strict=True)
+        ]
+        return math.sqrt(2 * self.share) * torch.stack(parts).sum(0)
 
     def repair(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
         """Its band is filled with the noise around it: another path of its own would differ from the recorded one."""
+        whole = _Band.of(comparison, self.mode).reach(self.mode, comparison)
+        for mode, times in zip(self.modes, self.turns, strict=True):
+            if bool(mode.gain.any()):
+                comparison = self._filled(comparison, mode, round(times * whole) if times != 1 else 0, generator)
+        return comparison
+
+    @staticmethod
+    def _filled(comparison: Comparison, mode: Mode, least: int, generator: torch.Generator) -> Comparison:
+        """With noise in the band of a line, of so many bins on either side at least."""
         signal, n = comparison.recording, comparison.n_samples
         ramp = torch.linspace(0, 1, n, dtype=torch.float64) * (signal[:, -1:] - signal[:, :1])
-        band, transform = _Band.of(comparison, self.mode), rampless_transform(comparison).clone()
+        band, transform = _Band.of(comparison, mode, least), rampless_transform(comparison).clone()
         inside = slice(band.first, band.last + 1)
         parts = torch.randn(2, *band.noise.shape, generator=generator, dtype=torch.float64)
         filled = torch.complex(parts[0], parts[1]) / math.sqrt(2) * band.noise.sqrt()
@@ -131,14 +155,15 @@ class _Band(NamedTuple):
     noise: Tensor
 
     @classmethod
-    def of(cls, comparison: Comparison, mode: Mode) -> _Band:
+    def of(cls, comparison: Comparison, mode: Mode, least: int = 0) -> _Band:
+        """That of a mode, of so many bins on either side at least."""
         n = comparison.n_samples
         bins = torch.arange(n // 2 + 1)
         density = comparison.base.spectrum(bins.clamp(min=1) / n)
         size = mode.gain.abs()
         concerned = size > _FAINT * size.amax()
         power = rampless_transform(comparison).abs().square() / density
-        first, last = _ends(power[concerned], mode, n)
+        first, last = _ends(power[concerned], mode, n, least)
         middle = round(mode.centre * n)
         below, above = (max(round(_FLANK * reach), _FEWEST) for reach in (middle - first, last - middle))
         # An octave below at most: what is slower leaks into the slowest ordinates, and is many times the noise there.
@@ -149,8 +174,13 @@ class _Band(NamedTuple):
         density = density[:, first : last + 1]
         return cls(power[:, first : last + 1] * density, concerned, first, last, level * density)
 
+    def reach(self, mode: Mode, comparison: Comparison) -> int:
+        """Bins on the longer side of the middle."""
+        middle = round(mode.centre * comparison.n_samples)
+        return max(middle - self.first, self.last - middle)
 
-def _ends(power: Tensor, mode: Mode, n_samples: int) -> tuple[int, int]:
+
+def _ends(power: Tensor, mode: Mode, n_samples: int, least: int) -> tuple[int, int]:
     """First and last bin of a line, of powers `(sensor, bin)` in units of the simulation's noise.
 
     A strong line is seen far beyond the widths of its middle, and none knows how its flanks fall: either end goes on
@@ -160,9 +190,9 @@ def _ends(power: Tensor, mode: Mode, n_samples: int) -> tuple[int, int]:
     logs = power.clamp(min=1e-300).log().mean(0)
     middle, ends = round(mode.centre * n_samples), []
     for side in (logs[1:middle].flip(0), logs[middle + 1 : n_samples // 2]):  # from the centre outwards
-        end = min(max(round(_REACH * mode.width * n_samples), 0), len(side))
+        end = min(max(round(_REACH * mode.width * n_samples), least), len(side))
         while True:
-            step, far = (max(round(_FLANK * end), least) for least in (_STEP, _FEWEST))
+            step, far = (max(round(_FLANK * end), fewest) for fewest in (_STEP, _FEWEST))
             near, beyond = side[end : end + step], side[end + step : end + step + far]
             chance = _SPREAD * math.sqrt(1 / step + 1 / far)
             if len(beyond) < far or float(near.mean() - beyond.mean()) < max(_SEEN * chance, least_more):

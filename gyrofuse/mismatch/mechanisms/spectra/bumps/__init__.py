@@ -1,0 +1,1 @@
+"""Bumps of a spectrum: resonances, and tones whose frequency wanders."""
