@@ -457,8 +457,9 @@ def _(setting: Setting) -> Drawn:
 
 @draws(WanderingHarmonics)
 def _(setting: Setting) -> Drawn:
-    mode = replace(_mode(setting, 1.5, 2.0, shared=True), centre=setting.even(0.06, 0.14))
-    second, third = (replace(mode, centre=k * mode.centre, width=k * mode.width, gain=0.7 * mode.gain) for k in (2, 3))
+    mode = _mode(setting, 0.35, 0.4, shared=True)
+    mode = replace(mode, centre=setting.even(0.06, 0.14), width=setting.even(4, 6) / setting.n_samples)
+    second, third = (replace(mode, centre=k * mode.centre, width=k * mode.width, gain=0.6 * mode.gain) for k in (2, 3))
     effect = WanderingHarmonics(mode, True, multiples=(2, 3), others=(second, third))
     return Drawn(effect, {"frequency": mode.centre * RATE})
 

@@ -21,8 +21,7 @@ from gyrofuse.mismatch.mechanisms.signals.harmonics import folded
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.lines import log_hotelling, sets_of
 
-_REACH, _FEWEST = 6.0, 32  # half widths of the line on either side of its centre, and bins
-_BESIDE = (4, 36)  # bins on either side of a line at frequency zero that show the noise
+_REACH = 6.0  # half widths of the line on either side of its centre
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,11 +39,11 @@ class PhaseTrack:
     @classmethod
     def of(cls, comparison: Comparison, peak: Oscillation) -> PhaseTrack | None:
         """That of a bump; None where noise hides its phase for more than a twentieth of the time."""
-        faint, often = 4.0, 1 / 20
+        faint, often, fewest = 4.0, 1 / 20, 32  # bins
         n, centre = comparison.n_samples, round(peak.centre * comparison.n_samples)
-        reach = max(round(_REACH * peak.width * n), _FEWEST)
+        reach = max(round(_REACH * peak.width * n), fewest)
         reach = min(reach, centre - 1, n // 2 - centre)
-        if reach < _FEWEST:
+        if reach < fewest:
             return None
         weights = weights_in_phase(comparison, peak)
         bins = (weights @ rampless_transform(comparison))[centre - reach : centre + reach]
@@ -120,11 +119,12 @@ def lines_in_step(comparison: Comparison, peak: Oscillation, track: PhaseTrack) 
 
 def _places(comparison: Comparison, peak: Oscillation, multiple: int, most: int) -> list[tuple[int, float]]:
     """Multiples of a fundamental frequency and where they are seen, apart from each other, cycles per sample."""
-    n, taken, places = comparison.n_samples, [(peak.centre, peak.width)], list[tuple[int, float]]()
+    n, margin = comparison.n_samples, 36  # bins
+    taken, places = [(peak.centre, peak.width)], list[tuple[int, float]]()
     for k in range(1, most + 1):
         ratio = k / multiple
         place = float(folded(torch.tensor(ratio * peak.centre, dtype=torch.float64)))
-        reach = _REACH * ratio * peak.width + _BESIDE[1] / n
+        reach = _REACH * ratio * peak.width + margin / n
         inside = reach < place < 0.5 - reach
         if inside and all(abs(place - other) > reach + _REACH * width for other, width in taken):
             places.append((k, place))
@@ -136,7 +136,7 @@ def _in_step(comparison: Comparison, track: PhaseTrack, multiple: int, ratio: fl
     """A line at a multiple of a phase, whether or not it is there."""
     n = comparison.n_samples
     turned = torch.fft.fft(comparison.white * torch.exp(-1j * ratio * track.phase)) / math.sqrt(n)
-    beside = torch.arange(*_BESIDE)
+    beside = torch.arange(4, 36)  # bins on either side of a line at frequency zero
     around = turned[:, torch.cat([beside, n - beside])]
     m = around.shape[-1]
     matrix, here = around @ around.mH / m, turned[:, 0]

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
+from torch import Tensor
 
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.detectors.spectra.peak_fit import Oscillation, oscillation_of
-from gyrofuse.mismatch.detectors.spectra.steadiness import steadiness
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
 from gyrofuse.mismatch.mechanisms.signals.harmonics import folded
 from gyrofuse.mismatch.mechanisms.spectra.bumps.oscillation import Mode, refitted_mode, wandering_sd
@@ -64,7 +64,7 @@ class WanderingHarmonics(DriftingTone):
         ]
         effect = cls(
             modes[0],
-            steadiness(comparison, peak).slow,
+            True,  # its phase is seen to be followed
             multiple=family.multiple,
             multiples=tuple(line.multiple for line in family.lines[1:]),
             others=tuple(modes[1:]),
@@ -109,6 +109,12 @@ class WanderingHarmonics(DriftingTone):
     @property
     def turns(self) -> tuple[float, ...]:
         return (1.0, *(k / self.multiple for k in self.multiples))
+
+    def course(self, n_samples: int, generator: torch.Generator) -> Tensor:
+        """Of a Lorentzian's law, up to twenty half widths: what is slow has the spectrum of its law."""
+        farthest, width = math.atan(20.0), self.mode.width
+        share = torch.special.erf(super().course(n_samples, generator) / (math.sqrt(2) * width))  # -1 to 1
+        return width * torch.tan(farthest * share)
 
     def fit_without(self, comparison: Comparison, fold: int) -> Mechanism:
         mode, *others = (refitted_mode(comparison, fold, one) for one in self.modes)

@@ -97,16 +97,19 @@ class DriftingTone(OscillationOnTop):
         parts = [mode.matrix() * mode.profile(f, resolution)[:, None, None] for mode in self.modes]
         return torch.stack(parts).sum(0)
 
-    def path(self, n_samples: int, generator: torch.Generator) -> Tensor:
+    def course(self, n_samples: int, generator: torch.Generator) -> Tensor:
+        """Its frequency less that of its centre, `(time,)`, cycles per sample."""
         width = self.mode.width
         memory = (_LONG if self.slow else _SHORT) / (2 * math.pi * width)  # samples
         phi = math.exp(-1 / memory)
         # A phase that diffuses as fast as a Lorentzian of that half width has it.
         spread = width if self.slow else math.sqrt(width / math.pi * (1 - phi) / (1 + phi))
-        steps = torch.randn(n_samples, generator=generator, dtype=torch.float64) * spread
-        steps[1:] *= math.sqrt(1 - phi**2)
+        return spread * _wandered(n_samples, phi, generator)
+
+    def path(self, n_samples: int, generator: torch.Generator) -> Tensor:
+        course = self.course(n_samples, generator)
         turn = 2 * math.pi * torch.rand((), generator=generator, dtype=torch.float64)
-        phase = 2 * math.pi * (self.mode.centre + _wandered(steps, phi)).cumsum(0) + turn
+        phase = 2 * math.pi * (self.mode.centre + course).cumsum(0) + turn
         parts = [
             mode.gain.abs()[:, None] * (mode.gain.angle()[:, None] + times * phase).cos()
             for mode, times in zip(self.modes, self.turns, strict=True)
@@ -231,8 +234,10 @@ def _share(comparison: Comparison, mode: Mode, normal: float) -> float:
     return max(float(drawn_towards(measured, torch.tensor(chance / whole**2), 1 - normal / 5)), 0.1)
 
 
-def _wandered(steps: Tensor, phi: float) -> Tensor:
-    """AR1 path `(time,)` of its steps, the first one stationary."""
+def _wandered(n_samples: int, phi: float, generator: torch.Generator) -> Tensor:
+    """Stationary AR1 path `(time,)` of variance one."""
+    steps = torch.randn(n_samples, generator=generator, dtype=torch.float64)
+    steps[1:] *= math.sqrt(1 - phi**2)
     return ar1_recursion(steps[None], torch.tensor([phi], dtype=steps.dtype))[0]
 
 
