@@ -65,6 +65,7 @@ from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
 from gyrofuse.mismatch.mechanisms.values.interleaving import Interleaving
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.values.sensor_gain import SensorGain
+from gyrofuse.mismatch.mechanisms.values.sensor_order import SensorOrder
 from gyrofuse.mismatch.mechanisms.values.stuck_samples import StuckSamples
 from gyrofuse.mismatch.mechanisms.values.unit_scale import UnitScale
 from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum
@@ -83,6 +84,14 @@ def acceleration(setting: Setting) -> Tensor:
 def _(setting: Setting) -> Drawn:
     factor = (math.degrees(1), 1000.0, 3600.0)[int(setting.even(0, 3))] ** setting.sign()
     return Drawn(UnitScale(factor), {"factor": factor})
+
+
+@draws(SensorOrder)
+def _(setting: Setting) -> Drawn:
+    place = list(range(setting.n_sensors))
+    for i, j in zip(setting.concerned, (*setting.concerned[1:], setting.concerned[0]), strict=True):
+        place[i] = j
+    return Drawn(SensorOrder(tuple(place)), {}, simulated=SensorGain(torch.arange(1, len(place) + 1).to(torch.float64)))
 
 
 @draws(SensorGain)

@@ -220,6 +220,21 @@ def test_a_filter_of_the_simulation_alone_is_told_as_such(recorded: float | None
         assert abs(finding.parameters["corner[0]"].value - corner) < 1
 
 
+def test_swapped_sensors_are_told_by_their_names() -> None:
+    """And what else is there is found in their places."""
+    own = np.array([[1.0], [1.6], [2.5]])
+    report = diagnosed((own * noise(1))[[2, 1, 0]] + tone_of_one(), own * noise(2))
+    assert sorted(f.mechanism for f in report.findings) == ["sensor_order", "vibration_tone"]
+    order = next(f for f in report.findings if f.mechanism == "sensor_order")
+    assert order.sensors == (0, 2)
+    assert "1 is like the simulation's 3, 3 is like the simulation's 1" in order.sentence
+    assert report.held_out.after < 2
+
+
+def tone_of_one() -> np.ndarray:
+    return np.array([[0.0], [0.5], [0.0]]) * np.cos(2 * math.pi * 31.27 * T)
+
+
 def ringing(seed: int, frequency: float, sd: float) -> np.ndarray:
     """Modes of their own in all sensors, of quality factor 15."""
     driven = np.random.default_rng(seed).standard_normal((3, N))

@@ -69,6 +69,7 @@ from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
 from gyrofuse.mismatch.mechanisms.values.interleaving import Interleaving
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.values.sensor_gain import SensorGain
+from gyrofuse.mismatch.mechanisms.values.sensor_order import SensorOrder
 from gyrofuse.mismatch.mechanisms.values.stuck_samples import StuckSamples
 from gyrofuse.mismatch.mechanisms.values.unit_scale import UnitScale
 from gyrofuse.mismatch.repair import serialise as saved
@@ -187,6 +188,7 @@ EVERY = (
     LowPassFilter("bilinear2", numbers(0.7, 0.0), undone=True),
     NotchFilter(0.11, 1 / 3, numbers(0.7, 0.0)),
     Resonance(MODE),
+    SensorOrder((1, 0)),
     DriftingTone(MODE, True, 0.9),
     WanderingHarmonics(MODE, True, 0.9, 2, (1, 3), (replace(MODE, centre=0.055), replace(MODE, centre=0.165))),
     FlickerNoise(numbers(1 / 3, 0.0)),

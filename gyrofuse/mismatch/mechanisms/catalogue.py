@@ -61,6 +61,7 @@ from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
 from gyrofuse.mismatch.mechanisms.values.interleaving import Interleaving
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.values.sensor_gain import SensorGain
+from gyrofuse.mismatch.mechanisms.values.sensor_order import SensorOrder
 from gyrofuse.mismatch.mechanisms.values.stuck_samples import StuckSamples
 from gyrofuse.mismatch.mechanisms.values.unit_scale import UnitScale
 
@@ -70,6 +71,7 @@ def _stage_of(kind: type[Mechanism]) -> int:
 
 
 STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
+    (SensorOrder,),  # whatever else is looked for sensor by sensor
     (UnitScale, SensorGain),
     (Quantization, Clipping, StuckSamples),  # facts on the numbers themselves
     (Spikes, ScaleMixture),

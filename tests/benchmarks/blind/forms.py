@@ -307,6 +307,20 @@ def several_modes(bench: Bench, nats: float) -> Part:
     return replace(part, signal=signal, frequency_hz=first * bench.rate, form="two modes")
 
 
+def swapped(bench: Bench, nats: float) -> Part:
+    """Two cables in each other's place: those of the sensors whose spectra differ most, by as many nats at least."""
+    spectra = bench.spectrum
+    apart = np.array([divergence(spectra, other).reshape(-1) for other in spectra[:, None]])  # (sensor, sensor)
+    apart = apart + apart.T
+    i, j = sorted(int(k) for k in np.unravel_index(apart.argmax(), apart.shape))
+    within("spectra that tell two sensors", nats, float(apart[i, j]), "nats")
+    order = np.arange(len(spectra))
+    order[[i, j]] = j, i
+    return Part(
+        "sensor_order", nats, (i, j), lambda recording: float(apart[i, j]), converter=lambda x: x[order], form="swapped"
+    )
+
+
 def simulated_resonance(bench: Bench, nats: float) -> Part:
     """A structure that the simulator lets ring, and the device has not."""
     part = resonance(bench, nats)

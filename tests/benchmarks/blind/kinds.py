@@ -149,6 +149,7 @@ _FORMS: dict[str, Callable[[Bench, float], Part]] = {
     "level_of_channel": forms.level_of_channel,
     "several_steps": _with(shapes.step, count=3),
     "several_modes": forms.several_modes,
+    "swapped": forms.swapped,
     "simulated_resonance": forms.simulated_resonance,
     "simulated_source": forms.simulated_source,
     "late_acceleration": forms.late_acceleration,

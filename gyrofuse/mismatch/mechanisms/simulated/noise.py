@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.detectors.spectra.peaks import strongest_peak
 from gyrofuse.mismatch.likelihoods.spectra.data import reference_noise, shared_ordinates
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
 from gyrofuse.mismatch.mechanisms.spectra.bumps.oscillation import Mode
@@ -51,6 +52,8 @@ class SimulatedNoise(Spectral):
         if comparison.reference.uncertainty is not None:
             return None
         other = _exchanged(comparison)
+        if not cls.may_be_there(comparison, other, level):
+            return None
         found = cls.kind.detect_and_fit(other, level)
         if found is None or not isinstance(found.effect, cls.kind) or not found.identified:
             return None
@@ -59,6 +62,17 @@ class SimulatedNoise(Spectral):
             return None
         sentence = found.sentence.replace("that the simulation does not have", "that only the simulation has")
         return replace(found, effect=effect, sentence=sentence)
+
+    @classmethod
+    def may_be_there(cls, comparison: Comparison, other: Comparison, level: float) -> bool:
+        """Whether it is worth looking for: at a glance, for most have nothing of it.
+
+        Args:
+            comparison: Recording and simulation.
+            other: The same with sides exchanged.
+            level: Largest p value.
+        """
+        raise NotImplementedError
 
     def stands_out(self, comparison: Comparison) -> bool:
         """Whether the simulation shows it by itself, and not only beside what the recording lacks."""
@@ -122,6 +136,10 @@ class SimulatedResonance(SimulatedNoise):
     def around(cls, noise: Addition, own: NoiseSpectrum) -> SimulatedResonance:
         assert isinstance(noise, Resonance)
         return cls(noise, own)
+
+    @classmethod
+    def may_be_there(cls, comparison: Comparison, other: Comparison, level: float) -> bool:
+        return _may_bulge(comparison, other, level)
 
     def stands_out(self, comparison: Comparison) -> bool:
         """As a bump of the simulation alone."""
@@ -218,6 +236,10 @@ class SimulatedWanderingTone(SimulatedNoise):
         assert isinstance(noise, DriftingTone)
         return cls(noise, own)
 
+    @classmethod
+    def may_be_there(cls, comparison: Comparison, other: Comparison, level: float) -> bool:
+        return _may_bulge(comparison, other, level)
+
     def stands_out(self, comparison: Comparison) -> bool:
         """As a bump of the simulation alone."""
         return _bulges(comparison, self.added.mode)
@@ -252,6 +274,12 @@ class SimulatedCommonMode(SimulatedNoise):
         assert isinstance(noise, CommonMode)
         return cls(noise, own)
 
+    @classmethod
+    def may_be_there(cls, comparison: Comparison, other: Comparison, level: float) -> bool:
+        fewest = 20.0  # ordinates
+        simulated, recorded = shared_ordinates(comparison)
+        return bool(((simulated > fewest) & (simulated > 2 * recorded)).any())
+
     def stands_out(self, comparison: Comparison) -> bool:
         """As what the simulation's sensors share alone."""
         simulated, recorded = shared_ordinates(comparison)
@@ -275,6 +303,16 @@ def _exchanged(comparison: Comparison) -> Comparison:
     sides = (replace(side, level_variance=varies) for side in (made.observed, made.reference))
     observed, reference = sides
     return replace(made, as_came=observed, observed=observed, reference=reference, seed=comparison.seed)
+
+
+def _may_bulge(comparison: Comparison, other: Comparison, level: float) -> bool:
+    """Whether a bump of the simulation over the recording is one of the simulation in any sensor."""
+    bump = strongest_peak(other)
+    if bump.p_value > level:
+        return False
+    mode = Mode(bump.frequency, bump.width / 4, torch.ones(comparison.n_sensors, dtype=torch.complex128), False)
+    simulated, recorded = (_over_flanks(side.steady, mode) for side in (comparison.reference, comparison.observed))
+    return bool(((simulated > 0) & (simulated > recorded)).any())
 
 
 def _bulges(comparison: Comparison, mode: Mode) -> bool:
