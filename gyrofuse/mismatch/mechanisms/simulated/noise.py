@@ -27,24 +27,18 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
+@dataclass(frozen=True, eq=False)
 class SimulatedNoise(Spectral):
     """`S -> M S M^H`, `M = N^1/2 (N^-1/2 (N + G) N^-1/2)^-1/2 N^-1/2`: of `N + G` the noise `N` is left.
 
-    Subclasses have the noise on top, `added`, and `own`, the recording's noise where that was found.
+    Attributes:
+        added: Noise on top, with the spectra `G`.
+        own: The recording's noise, `N`, where that was found.
     """
 
     kind: ClassVar[type[Addition]]
+    added: Addition
     own: NoiseSpectrum
-
-    @property
-    def noise(self) -> Addition:
-        """What is taken off."""
-        raise NotImplementedError
-
-    @classmethod
-    def around(cls, noise: Addition, own: NoiseSpectrum) -> SimulatedNoise:
-        """The mechanism that takes noise off."""
-        raise NotImplementedError
 
     @classmethod
     def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
@@ -57,7 +51,7 @@ class SimulatedNoise(Spectral):
         found = cls.kind.detect_and_fit(other, level)
         if found is None or not isinstance(found.effect, cls.kind) or not found.identified:
             return None
-        effect = cls.around(replace(found.effect, company=()), reference_noise(other))
+        effect = cls(replace(found.effect, company=()), reference_noise(other))
         if not effect.stands_out(comparison):
             return None
         sentence = found.sentence.replace("that the simulation does not have", "that only the simulation has")
@@ -86,12 +80,12 @@ class SimulatedNoise(Spectral):
         return torch.diag_embed(self.own.spectrum(f.clamp(min=1 / self.own.n_samples)).mT).to(torch.complex128)
 
     def _before(self, matrices: Tensor, f: Tensor) -> Tensor:
-        return self.noise.spectra(self._after(matrices, f), f)
+        return self.added.spectra(self._after(matrices, f), f)
 
     def mixing(self, f: Tensor) -> Tensor:
         """Complex gains `(frequency, sensor, sensor)` at `f` cycles per sample."""
         level = self.own.spectrum(f.clamp(min=1 / self.own.n_samples)).mT.sqrt()  # (frequency, sensor)
-        both = self.noise.spectra(torch.diag_embed(level.square()).to(torch.complex128), f)
+        both = self.added.spectra(torch.diag_embed(level.square()).to(torch.complex128), f)
         values, vectors = torch.linalg.eigh(both / (level[:, :, None] * level[:, None, :]))
         root = (vectors * values.clamp(min=1e-12).rsqrt()[:, None, :]) @ vectors.mH
         return level[:, :, None] * root / level[:, None, :]
@@ -107,6 +101,9 @@ class SimulatedNoise(Spectral):
         before = torch.diag_embed(base.spectrum(f).mT).to(torch.complex128)
         return (self.spectra(before, f) / before.diagonal(dim1=-2, dim2=-1)[:, None]).diagonal(dim1=-2, dim2=-1).real.mT
 
+    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+        self.added.plot(comparison, ax, sensor=sensor, fitted=fitted)
+
     def fit_without(self, comparison: Comparison, fold: int) -> Mechanism:
         """Its numbers are those of the simulation, of which nothing is held out."""
         return self
@@ -114,28 +111,13 @@ class SimulatedNoise(Spectral):
 
 @dataclass(frozen=True, eq=False)
 class SimulatedResonance(SimulatedNoise):
-    """A mode that only the simulation has.
-
-    Attributes:
-        added: The mode.
-        own: Noise of the recording.
-    """
+    """A mode that only the simulation has."""
 
     name: ClassVar[str] = "resonance"
     rivals: ClassVar[tuple[str, ...]] = ("parameter_shift", "low_pass")
     separated_by: ClassVar[str] = Resonance.separated_by
     kind: ClassVar[type[Addition]] = Resonance
     added: Resonance
-    own: NoiseSpectrum
-
-    @property
-    def noise(self) -> Addition:
-        return self.added
-
-    @classmethod
-    def around(cls, noise: Addition, own: NoiseSpectrum) -> SimulatedResonance:
-        assert isinstance(noise, Resonance)
-        return cls(noise, own)
 
     @classmethod
     def may_be_there(cls, comparison: Comparison, other: Comparison, level: float) -> bool:
@@ -144,9 +126,6 @@ class SimulatedResonance(SimulatedNoise):
     def stands_out(self, comparison: Comparison) -> bool:
         """As a bump of the simulation alone."""
         return _bulges(comparison, self.added.mode)
-
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
-        self.added.plot(comparison, ax, sensor=sensor, fitted=fitted)
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,7 +179,7 @@ class MovedResonance(SimulatedResonance):
         return self.recorded.spectra(super()._after(matrices, f), f)
 
     def _before(self, matrices: Tensor, f: Tensor) -> Tensor:
-        return self.noise.spectra(super()._after(matrices, f), f)
+        return self.added.spectra(super()._after(matrices, f), f)
 
     def apply_to_reference(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
         built = super().apply_to_reference(comparison, generator)
@@ -213,28 +192,13 @@ class MovedResonance(SimulatedResonance):
 
 @dataclass(frozen=True, eq=False)
 class SimulatedWanderingTone(SimulatedNoise):
-    """A wandering tone that only the simulation has.
-
-    Attributes:
-        added: The tone.
-        own: Noise of the recording.
-    """
+    """A wandering tone that only the simulation has."""
 
     name: ClassVar[str] = "drifting_tone"
     rivals: ClassVar[tuple[str, ...]] = ("parameter_shift",)
     separated_by: ClassVar[str] = DriftingTone.separated_by
     kind: ClassVar[type[Addition]] = DriftingTone
     added: DriftingTone
-    own: NoiseSpectrum
-
-    @property
-    def noise(self) -> Addition:
-        return self.added
-
-    @classmethod
-    def around(cls, noise: Addition, own: NoiseSpectrum) -> SimulatedWanderingTone:
-        assert isinstance(noise, DriftingTone)
-        return cls(noise, own)
 
     @classmethod
     def may_be_there(cls, comparison: Comparison, other: Comparison, level: float) -> bool:
@@ -253,26 +217,12 @@ class SimulatedCommonMode(SimulatedNoise):
     """Noise of one source in the simulation's sensors, and not in the recording's.
 
     Other numbers leave what sensors share as it is, in units of their powers.
-
-    Attributes:
-        added: The noise.
-        own: Noise of the recording.
     """
 
     name: ClassVar[str] = "common_mode"
     separated_by: ClassVar[str] = CommonMode.separated_by
     kind: ClassVar[type[Addition]] = CommonMode
     added: CommonMode
-    own: NoiseSpectrum
-
-    @property
-    def noise(self) -> Addition:
-        return self.added
-
-    @classmethod
-    def around(cls, noise: Addition, own: NoiseSpectrum) -> SimulatedCommonMode:
-        assert isinstance(noise, CommonMode)
-        return cls(noise, own)
 
     @classmethod
     def may_be_there(cls, comparison: Comparison, other: Comparison, level: float) -> bool:
@@ -285,9 +235,6 @@ class SimulatedCommonMode(SimulatedNoise):
         simulated, recorded = shared_ordinates(comparison)
         has = self.added.gain != 0
         return 2 * float(recorded[has].sum()) < float(simulated[has].sum())
-
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
-        self.added.plot(comparison, ax, sensor=sensor, fitted=fitted)
 
 
 @derived
