@@ -66,6 +66,11 @@ class PhaseTrack:
         left = left - t * (left @ t) / (t @ t)
         return float(left.std()) > 1
 
+    def spread(self, width: float) -> float:
+        """Standard deviation of its frequency over an eighth of the time in which a line of a width turns once more."""
+        lag = min(max(round(1 / (8 * width)), 1), len(self.phase) // 4)
+        return float((self.phase[lag:] - self.phase[:-lag]).std()) / (2 * math.pi * lag)
+
     def kept(self, ratio: float) -> float:
         """Share of an amplitude that is left at a multiple of the phase, by what noise moves that."""
         return float(torch.exp(-(ratio**2) / (4 * self.clearness.clamp(min=1.0))).mean())

@@ -33,6 +33,7 @@ class WanderingHarmonics(DriftingTone):
 
     rivals: ClassVar[tuple[str, ...]] = ()
     named_together: ClassVar[tuple[str, ...]] = ()
+    shown: ClassVar[float] = 15.0
     multiple: int = 1
     multiples: tuple[int, ...] = ()
     others: tuple[Mode, ...] = ()
@@ -44,13 +45,15 @@ class WanderingHarmonics(DriftingTone):
         if peak is None or peak.stretch.p_value > level or peak.width > narrow * peak.centre:
             return None
         track = PhaseTrack.of(comparison, peak)
-        family = None if track is None or not track.wanders else lines_in_step(comparison, peak, track)
+        if track is None or not track.wanders:
+            return None
+        family = lines_in_step(comparison, peak, track)
         if family is None or family.p_value > level:
             return None
-        return cls._found(comparison, peak, family)
+        return cls._found(comparison, peak, family, track.spread(peak.width) * comparison.info.rate)
 
     @classmethod
-    def _found(cls, comparison: Comparison, peak: Oscillation, family: Family) -> Finding:
+    def _found(cls, comparison: Comparison, peak: Oscillation, family: Family, spread_hz: float) -> Finding:
         own, info = family.lines[0], comparison.info
         plain, most_told = 30.0, 6  # square of an amplitude; harmonics with limits
         modes = [
@@ -90,7 +93,7 @@ class WanderingHarmonics(DriftingTone):
         return Finding(
             cls.name,
             effect,
-            f"a tone near {peak.centre * rate:.4g} Hz whose frequency wanders by about {peak.width * rate:.2g} Hz, in "
+            f"a tone near {peak.centre * rate:.4g} Hz whose frequency wanders by about {spread_hz:.2g} Hz, in "
             f"{info.named(sensors, 'all sensors')}, of amplitude up to {float(own.amplitude.abs().max()):.3g} "
             f"{info.measure}, that the simulation does not have; {_many(len(times.split(', ')))} in step with it, at "
             f"{times} times {fundamental:.4g} Hz{itself}, as of something that turns",

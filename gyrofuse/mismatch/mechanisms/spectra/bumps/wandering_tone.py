@@ -51,6 +51,7 @@ class DriftingTone(OscillationOnTop):
     named_together: ClassVar[tuple[str, ...]] = ("resonance",)
     separated_by: ClassVar[str] = "a longer recording, over which the frequency moves by more than its own width"
     additive: ClassVar[bool] = True
+    shown: ClassVar[float] = 6.0  # half widths on either side in a picture
     mode: Mode
     slow: bool
     share: float = 1.0
@@ -78,7 +79,7 @@ class DriftingTone(OscillationOnTop):
     def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
         rate = comparison.info.rate
         centre, width = self.mode.centre * rate, max(self.mode.width * rate, rate / comparison.n_samples)
-        band, window = (centre - 6 * width, centre + 6 * width), 2 / width
+        band, window = (centre - self.shown * width, centre + self.shown * width), 2 / width
         track = _loudest(comparison, sensor, band, window) if fitted else None
         pictures.spectrogram(ax, comparison, sensor, band, window, track)
 
