@@ -19,6 +19,9 @@ from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.lines import whitened
 
+_MEAN_OF = 16  # samples, whose means show what is smooth
+_CHI2_MEDIAN = 0.455  # of one degree of freedom
+
 
 class Stretch(NamedTuple):
     """One stretch.
@@ -39,30 +42,64 @@ class Stretch(NamedTuple):
 
 @derived
 def handled(comparison: Comparison) -> tuple[Stretch, ...]:
-    """Stretches in which the recording's device is handled, in the order of time; none where the simulation has any."""
+    """Stretches in which the recording's device is handled, in the order of time; none where the simulation has any.
+
+    Nor where slow noise of the simulation is by chance nearly as loud for as long.
+    """
     found = _stretches(comparison.white, comparison.recording)
-    simulated = comparison.reference.signal[:2] if found else ()
-    if any(_stretches(whitened(record, comparison.base), record) for record in simulated):
+    simulated = (
+        [(whitened(record, comparison.base), record) for record in comparison.reference.signal[:2]] if found else []
+    )
+    if any(_stretches(*one) for one in simulated):
         return ()
-    return tuple(found)
+    beyond = 1.5  # times as loud
+    return tuple(
+        one
+        for one in found
+        if all(
+            float(_loudness(comparison.white[:, one.first : one.end], one, comparison.white))
+            > beyond * float(_loudness(white, one, white))
+            for white, _ in simulated
+        )
+    )
+
+
+def _loudness(white: Tensor, stretch: Stretch, whole: Tensor) -> Tensor:
+    """Power of the means of the loudest part that is as long as a stretch, over the median, in the sensors that move.
+
+    Args:
+        white: Whitened signals `(sensor, time)`, in which it is looked for.
+        stretch: The stretch.
+        whole: Signals that say what is usual.
+    """
+    power, usual = (_means(x)[stretch.which].square() for x in (white, whole))
+    level = usual.median(-1, keepdim=True).values.clamp(min=1e-300) / _CHI2_MEDIAN
+    length = min((stretch.end - stretch.first) // _MEAN_OF, power.shape[-1])
+    return (power / level).mean(0).unfold(-1, length, max(length // 8, 1)).mean(-1).max()
+
+
+def _means(white: Tensor) -> Tensor:
+    """Means of samples `(sensor, mean)`, which show what is smooth; of white noise they have its variance."""
+    return white[:, : white.shape[-1] // _MEAN_OF * _MEAN_OF].unflatten(-1, (-1, _MEAN_OF)).mean(-1) * math.sqrt(
+        _MEAN_OF
+    )
 
 
 def _stretches(white: Tensor, signal: Tensor) -> list[Stretch]:
     louder, fewest_cells, most = 2.5, 4, 0.3  # times the usual variance; cells in a row; share of the record
-    mean_of = 16  # samples, whose means show what is smooth
-    n = white.shape[-1]
+    n, mean_of = white.shape[-1], _MEAN_OF
     cell = min(max(n // 512 // mean_of * mean_of, 2 * mean_of), 256)
     n_cells = n // cell
     if n_cells < 16 * fewest_cells:
         return []
-    means = white[:, : n // mean_of * mean_of].unflatten(-1, (-1, mean_of)).mean(-1) * math.sqrt(mean_of)
+    means = _means(white)
     of_cells = means[:, : n_cells * (cell // mean_of)].unflatten(-1, (n_cells, -1)).square().mean(-1)
     power = torch.nn.functional.avg_pool1d(of_cells, 3, 1, 1, count_include_pad=False)  # (sensor, cell)
     level = power.median(-1, keepdim=True).values.clamp(min=1e-300)
     # One sensor alone may be louder for many reasons; of many each need not be as loud.
     least = louder**2 if len(white) == 1 else 1 + (louder - 1) * min(math.sqrt(4 / len(white)), 1.0)
     moves = (power / level > least).sum(0) >= max(len(white) / 2, min(2, len(white)))
-    usual = white.square().median(-1).values.clamp(min=1e-300) / 0.455  # median of chi2_1
+    usual = white.square().median(-1).values.clamp(min=1e-300) / _CHI2_MEDIAN
     found = []
     for first, end in _as_far_as_seen((power / level).mean(0), _runs(moves, fewest_cells)):
         start, stop = max(first - 1, 0) * cell, min((end + 1) * cell, means.shape[-1] * mean_of)
