@@ -20,7 +20,7 @@ from gyrofuse.mismatch.likelihoods import outlier_law as outliers
 from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
 from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
 from gyrofuse.mismatch.mechanisms.spectra import joint_fit as shapes
-from gyrofuse.mismatch.mechanisms.spectra import oscillation as oscillating
+from gyrofuse.mismatch.mechanisms.spectra.bumps import oscillation as oscillating
 from gyrofuse.mismatch.mechanisms.spectra.bumps.resonance import Resonance
 from gyrofuse.mismatch.mechanisms.spectra.bumps.wandering_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
