@@ -18,9 +18,9 @@ from gyrofuse._base.transforms import squared_modulus
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.lines import whitened
+from gyrofuse.mismatch.stats.segments import CHI2_MEDIAN
 
 _MEAN_OF = 16  # samples, whose means show what is smooth
-_CHI2_MEDIAN = 0.455  # of one degree of freedom
 
 
 class Stretch(NamedTuple):
@@ -73,7 +73,7 @@ def _loudness(white: Tensor, stretch: Stretch, whole: Tensor) -> Tensor:
         whole: Signals that say what is usual.
     """
     power, usual = (_means(x)[stretch.which].square() for x in (white, whole))
-    level = usual.median(-1, keepdim=True).values.clamp(min=1e-300) / _CHI2_MEDIAN
+    level = usual.median(-1, keepdim=True).values.clamp(min=1e-300) / CHI2_MEDIAN
     length = min((stretch.end - stretch.first) // _MEAN_OF, power.shape[-1])
     return (power / level).mean(0).unfold(-1, length, max(length // 8, 1)).mean(-1).max()
 
@@ -99,7 +99,7 @@ def _stretches(white: Tensor, signal: Tensor) -> list[Stretch]:
     # One sensor alone may be louder for many reasons; of many each need not be as loud.
     least = louder**2 if len(white) == 1 else 1 + (louder - 1) * min(math.sqrt(4 / len(white)), 1.0)
     moves = (power / level > least).sum(0) >= max(len(white) / 2, min(2, len(white)))
-    usual = white.square().median(-1).values.clamp(min=1e-300) / _CHI2_MEDIAN
+    usual = white.square().median(-1).values.clamp(min=1e-300) / CHI2_MEDIAN
     found = []
     for first, end in _as_far_as_seen((power / level).mean(0), _runs(moves, fewest_cells)):
         start, stop = max(first - 1, 0) * cell, min((end + 1) * cell, means.shape[-1] * mean_of)

@@ -21,8 +21,6 @@ from gyrofuse.mismatch.mechanisms.signals.harmonics import folded
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.lines import log_hotelling, sets_of
 
-_REACH = 6.0  # half widths of the line on either side of its centre
-
 
 @dataclass(frozen=True, eq=False)
 class PhaseTrack:
@@ -41,7 +39,7 @@ class PhaseTrack:
         """That of a bump; None where noise hides its phase for more than a twentieth of the time."""
         faint, often, fewest = 4.0, 1 / 20, 32  # bins
         n, centre = comparison.n_samples, round(peak.centre * comparison.n_samples)
-        reach = max(round(_REACH * peak.width * n), fewest)
+        reach = max(round(_reach(peak.width) * n), fewest)
         reach = min(reach, centre - 1, n // 2 - centre)
         if reach < fewest:
             return None
@@ -129,12 +127,17 @@ def _places(comparison: Comparison, peak: Oscillation, multiple: int, most: int)
     for k in range(1, most + 1):
         ratio = k / multiple
         place = float(folded(torch.tensor(ratio * peak.centre, dtype=torch.float64)))
-        reach = _REACH * ratio * peak.width + margin / n
+        reach = _reach(ratio * peak.width) + margin / n
         inside = reach < place < 0.5 - reach
-        if inside and all(abs(place - other) > reach + _REACH * width for other, width in taken):
+        if inside and all(abs(place - other) > reach + _reach(width) for other, width in taken):
             places.append((k, place))
             taken.append((place, ratio * peak.width))
     return places
+
+
+def _reach(width: float) -> float:
+    """On either side of the centre of a line of a half width."""
+    return 6 * width
 
 
 def _in_step(comparison: Comparison, track: PhaseTrack, multiple: int, ratio: float, place: float) -> InStep:
