@@ -252,8 +252,12 @@ def test_oracle_keeps_its_false_alarm_rate():
     assert binom.ppf(0.001, trials, 0.05) <= alarms <= binom.ppf(0.999, trials, 0.05)
 
 
-# Those of single samples are certain; few designs of filters act as weakly; a trap's dwells change nothing.
-UNSIZED = ("quantization_bare", "dead_band", "clipping", "stuck_samples", "form:filter", "form:asymmetric_telegraph")
+# Those of single samples are certain; few designs of filters act as weakly; a trap's dwells change nothing; what only
+# the simulation has no recording shows.
+UNSIZED = (
+    *("quantization_bare", "dead_band", "clipping", "stuck_samples", "form:filter", "form:asymmetric_telegraph"),
+    *("form:simulated_resonance", "form:simulated_source"),
+)
 SIZES = [k for k in EFFECTS if kinds.KINDS[k].group in ("mechanism", "outside", "form") and k not in UNSIZED]
 
 

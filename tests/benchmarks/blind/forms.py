@@ -317,7 +317,13 @@ def swapped(bench: Bench, nats: float) -> Part:
     order = np.arange(len(spectra))
     order[[i, j]] = j, i
     return Part(
-        "sensor_order", nats, (i, j), lambda recording: float(apart[i, j]), converter=lambda x: x[order], form="swapped"
+        "sensor_order",
+        nats,
+        (i, j),
+        lambda recording: spectral_llr(recording, spectra[order], spectra),
+        converter=lambda x: x[order],
+        oracle_nats=float(apart[i, j]),
+        form="swapped",
     )
 
 
