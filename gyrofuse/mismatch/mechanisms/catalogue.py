@@ -116,10 +116,10 @@ UNNAMED: tuple[type[SlowRemainder] | type[Remainder] | type[CoherenceRemainder],
 )
 
 # Every mechanism that a repaired simulation may have; a dead band is looked for where no quantisation grid is found.
-CATALOGUE: tuple[type[Mechanism], ...] = (*dict.fromkeys(itertools.chain(*STAGES)), DeadBand, *UNNAMED)
+CATALOGUE: tuple[type[Mechanism], ...] = (*itertools.chain(*STAGES), DeadBand, *UNNAMED)
 
 
 def named(names: Iterable[str]) -> list[type[Mechanism]]:
     """Mechanisms of the stages that have one of these names, in their order; several forms may share a name."""
     wanted = frozenset(names)
-    return [kind for kind in dict.fromkeys(itertools.chain(*STAGES)) if kind.name in wanted]
+    return [kind for kind in itertools.chain(*STAGES) if kind.name in wanted]

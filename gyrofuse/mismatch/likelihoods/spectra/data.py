@@ -144,6 +144,7 @@ def reference_noise(comparison: Comparison) -> NoiseSpectrum:
     return fit_base(matrices.diagonal(dim1=-2, dim2=-1).real.mT, both.bands, comparison.n_samples, s)
 
 
+@derived
 def shared_ordinates(comparison: Comparison) -> tuple[Tensor, Tensor]:
     """Complex ordinates that a sensor shares with the others, in the simulation and in the recording, `(sensor,)`.
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from gyrofuse.mismatch.detectors.spectra.peaks import strongest_peak
 from gyrofuse.mismatch.likelihoods.spectra.data import reference_noise, shared_ordinates
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
-from gyrofuse.mismatch.mechanisms.spectra.bumps.oscillation import Mode
+from gyrofuse.mismatch.mechanisms.spectra.bumps.oscillation import Mode, OscillationOnTop
 from gyrofuse.mismatch.mechanisms.spectra.bumps.resonance import Resonance
 from gyrofuse.mismatch.mechanisms.spectra.bumps.wandering_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
@@ -110,14 +110,10 @@ class SimulatedNoise(Spectral):
 
 
 @dataclass(frozen=True, eq=False)
-class SimulatedResonance(SimulatedNoise):
-    """A mode that only the simulation has."""
+class SimulatedBump(SimulatedNoise):
+    """A bump that only the simulation has."""
 
-    name: ClassVar[str] = "resonance"
-    rivals: ClassVar[tuple[str, ...]] = ("parameter_shift", "low_pass")
-    separated_by: ClassVar[str] = Resonance.separated_by
-    kind: ClassVar[type[Addition]] = Resonance
-    added: Resonance
+    added: OscillationOnTop
 
     @classmethod
     def may_be_there(cls, comparison: Comparison, other: Comparison, level: float) -> bool:
@@ -126,6 +122,17 @@ class SimulatedResonance(SimulatedNoise):
     def stands_out(self, comparison: Comparison) -> bool:
         """As a bump of the simulation alone."""
         return _bulges(comparison, self.added.mode)
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedResonance(SimulatedBump):
+    """A mode that only the simulation has."""
+
+    name: ClassVar[str] = "resonance"
+    rivals: ClassVar[tuple[str, ...]] = ("parameter_shift", "low_pass")
+    separated_by: ClassVar[str] = Resonance.separated_by
+    kind: ClassVar[type[Addition]] = Resonance
+    added: Resonance
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +198,7 @@ class MovedResonance(SimulatedResonance):
 
 
 @dataclass(frozen=True, eq=False)
-class SimulatedWanderingTone(SimulatedNoise):
+class SimulatedWanderingTone(SimulatedBump):
     """A wandering tone that only the simulation has."""
 
     name: ClassVar[str] = "drifting_tone"
@@ -199,14 +206,6 @@ class SimulatedWanderingTone(SimulatedNoise):
     separated_by: ClassVar[str] = DriftingTone.separated_by
     kind: ClassVar[type[Addition]] = DriftingTone
     added: DriftingTone
-
-    @classmethod
-    def may_be_there(cls, comparison: Comparison, other: Comparison, level: float) -> bool:
-        return _may_bulge(comparison, other, level)
-
-    def stands_out(self, comparison: Comparison) -> bool:
-        """As a bump of the simulation alone."""
-        return _bulges(comparison, self.added.mode)
 
     def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
         Resonance(self.added.mode).plot(comparison, ax, sensor=sensor, fitted=fitted)

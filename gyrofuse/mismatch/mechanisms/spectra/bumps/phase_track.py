@@ -107,10 +107,14 @@ class Family(NamedTuple):
 def lines_in_step(comparison: Comparison, peak: Oscillation, track: PhaseTrack) -> Family | None:
     """Lines at multiples of a line that wanders, or of a half or a third of it; None where there is no other."""
     highest, found = 12, []
+    by_ratio = dict[float, InStep]()  # the multiples 2, 4 and 6 of one, a half and a third of a line are the same
     for multiple in (1, 2, 3):
         places = _places(comparison, peak, multiple, highest * multiple)
         each = CHANCE / (3 * max(len(places), 1))
-        lines = [_in_step(comparison, track, k, k / multiple, place) for k, place in places]
+        for k, place in places:
+            if k / multiple not in by_ratio:
+                by_ratio[k / multiple] = _in_step(comparison, track, k, k / multiple, place)
+        lines = [by_ratio[k / multiple]._replace(multiple=k) for k, _ in places]
         others = [line for line in lines if line.log_p < math.log(each)]
         if others:
             own = _in_step(comparison, track, multiple, 1.0, peak.centre)
