@@ -42,6 +42,7 @@ from gyrofuse.mismatch.mechanisms.simulated.noise import (
     SimulatedResonance,
     SimulatedWanderingTone,
 )
+from gyrofuse.mismatch.mechanisms.simulated.spikes import SimulatedSpikes
 from gyrofuse.mismatch.mechanisms.slow.bias_oscillation import BiasOscillation
 from gyrofuse.mismatch.mechanisms.slow.late_warm_up import LateWarmUp
 from gyrofuse.mismatch.mechanisms.slow.ramp import Ramp
@@ -139,16 +140,20 @@ def _(setting: Setting) -> Drawn:
 # The law of single samples, and what changes with time.
 
 
-@draws(Spikes)
-def _(setting: Setting) -> Drawn:
+def _spikes(setting: Setting, low: float, high: float) -> Drawn:
     together = setting.chance() and len(setting.concerned) > 1
-    rate = (setting.sizes(0.001, 0.002) * setting.size).clamp(max=0.02)
+    rate = (setting.sizes(low, high) * setting.size).clamp(max=0.02)
     if together:
         rate = torch.where(rate > 0, rate.max(), 0.0)
     effect = Spikes(rate, setting.sizes(6.0, 9.0), setting.sizes(0.5, 1.0), together)
     per_hour = rate * RATE * 3600
     rates = {"rate": float(per_hour.max())} if together else {}
     return Drawn(effect, setting.of_each("amplitude", effect.amplitude) | rates | setting.of_each("rate", per_hour))
+
+
+@draws(Spikes)
+def _(setting: Setting) -> Drawn:
+    return _spikes(setting, 0.001, 0.002)
 
 
 @draws(ScaleMixture)
@@ -503,6 +508,13 @@ def _(setting: Setting) -> Drawn:
 
 def _own(setting: Setting) -> NoiseSpectrum:
     return noise_spectrum(setting.n_sensors, setting.n_samples)
+
+
+@draws(SimulatedSpikes)
+def _(setting: Setting) -> Drawn:
+    drawn = _spikes(setting, 0.005, 0.01)  # each that is missing says a nat
+    assert isinstance(drawn.effect, Spikes)
+    return Drawn(SimulatedSpikes(drawn.effect), drawn.truth, simulated=drawn.effect)
 
 
 @draws(SimulatedResonance)

@@ -256,7 +256,7 @@ def test_oracle_keeps_its_false_alarm_rate():
 # the simulation has no recording shows.
 UNSIZED = (
     *("quantization_bare", "dead_band", "clipping", "stuck_samples", "form:filter", "form:asymmetric_telegraph"),
-    *("form:simulated_resonance", "form:simulated_source"),
+    *("form:simulated_resonance", "form:simulated_source", "form:simulated_spikes"),
 )
 SIZES = [k for k in EFFECTS if kinds.KINDS[k].group in ("mechanism", "outside", "form") and k not in UNSIZED]
 

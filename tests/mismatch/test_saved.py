@@ -46,6 +46,7 @@ from gyrofuse.mismatch.mechanisms.simulated.noise import (
     SimulatedResonance,
     SimulatedWanderingTone,
 )
+from gyrofuse.mismatch.mechanisms.simulated.spikes import SimulatedSpikes
 from gyrofuse.mismatch.mechanisms.slow.bias_oscillation import BiasOscillation
 from gyrofuse.mismatch.mechanisms.slow.late_warm_up import LateWarmUp
 from gyrofuse.mismatch.mechanisms.slow.ramp import Ramp
@@ -105,6 +106,7 @@ EVERY = (
     StuckSamples(numbers(0.2, 0.0), numbers(0.01, 0.0), False, (), (1 / 3, 0.0)),  # of single samples
     ScaleMixture(numbers(0.2, 0.0), numbers(3.0, 1.0)),
     Spikes(numbers(0.05, 0.0), numbers(7 / 3, 0.0), numbers(0.3, 0.0), True),
+    SimulatedSpikes(Spikes(numbers(0.05, 0.0), numbers(7 / 3, 0.0), numbers(0.3, 0.0), False)),
     ClockSkew((1,), 1e-5 / 3, ((200, 2), (300, 1)), 0.07, complex_numbers(0.3j), complex_numbers(0.1)),
     GSensitivity("acceleration", torch.tensor([[0.1, 0.2, 1 / 3], [0.0, 0.0, 0.0]], dtype=torch.float64)),
     QuadraticCoupling("acceleration", torch.tensor([[1 / 3], [0.1]], dtype=torch.float64), "axis 2"),

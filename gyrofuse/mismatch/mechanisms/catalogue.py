@@ -39,6 +39,7 @@ from gyrofuse.mismatch.mechanisms.simulated.noise import (
     SimulatedResonance,
     SimulatedWanderingTone,
 )
+from gyrofuse.mismatch.mechanisms.simulated.spikes import SimulatedSpikes
 from gyrofuse.mismatch.mechanisms.slow.bias_oscillation import BiasOscillation
 from gyrofuse.mismatch.mechanisms.slow.late_warm_up import LateWarmUp
 from gyrofuse.mismatch.mechanisms.slow.ramp import Ramp
@@ -74,7 +75,7 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (SensorOrder,),  # whatever else is looked for sensor by sensor
     (UnitScale, SensorGain),
     (Quantization, Clipping, StuckSamples),  # facts on the numbers themselves
-    (Spikes, ScaleMixture),
+    (Spikes, SimulatedSpikes, ScaleMixture),
     (ClockSkew, TimeScale),
     (GSensitivity, QuadraticCoupling, ScaleFactor, ChannelCoupling, ChannelTransfer),
     (Motion,),  # whose smooth course looks like any of these

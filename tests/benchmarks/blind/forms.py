@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal as sps
 
-from . import mechanics, shapes, thermal
+from . import marginal, mechanics, shapes, thermal
 from .analog import OVERSAMPLING, relaxator
 from .bench import Bench, Part, quantity, rms
 from .likelihood import ar1_spectrum, comparison, divergence, folded, grid, quadratic_null, solve, spectral_llr, within
@@ -340,6 +340,13 @@ def simulated_source(bench: Bench, nats: float) -> Part:
     gains = bench.gains(sensors) * bench.sigma
     part, size = added(bench, "common_mode", nats, gains[:, None] ** 2 * np.ones_like(bench.spectrum), broad=True)
     return _of_the_simulation(part, math.sqrt(size) * gains[:, None] * bench.rng.standard_normal(bench.n))
+
+
+def simulated_spikes(bench: Bench, nats: float) -> Part:
+    """Outliers that the simulator draws, as a real device of the kind had them, and this one has not."""
+    part = marginal.spikes(bench, nats)
+    assert part.signal is not None
+    return _of_the_simulation(part, part.signal)
 
 
 def _of_the_simulation(part: Part, path: Array) -> Part:

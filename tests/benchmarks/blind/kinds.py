@@ -152,6 +152,7 @@ _FORMS: dict[str, Callable[[Bench, float], Part]] = {
     "swapped": forms.swapped,
     "simulated_resonance": forms.simulated_resonance,
     "simulated_source": forms.simulated_source,
+    "simulated_spikes": forms.simulated_spikes,
     "late_acceleration": forms.late_acceleration,
     "coloured_source": forms.coloured_source,
 }
@@ -192,6 +193,7 @@ _OF_FORMS: dict[str, tuple[tuple[str, Any], ...]] = {
     "handled": (_OF_RECORD,),  # a device moves as a whole
     "simulated_resonance": (_AS_LONG,),
     "simulated_source": (_AS_LONG,),
+    "simulated_spikes": (_AS_LONG,),
 }
 
 KINDS: dict[str, Kind] = {

@@ -52,12 +52,18 @@ def outliers_test(comparison: Comparison) -> TestResult:
         sensors = tuple((many.sensors > 0.5).nonzero()[:, 0].tolist()) or sensors
         words = f"outliers of {many.size:g} sd {'in several sensors at once' if many.shock else 'in single sensors'}"
     fewer = _fewer_p_values(comparison)
-    p_fewer = sidak(float(fewer.min()), len(fewer))
+    p_fewer = fewer_outliers_p_value(comparison)
     place: float | None = at / comparison.info.rate
     if p_fewer < p_value:
         sensors, place = (int(fewer.argmin()),), None
         words = f"fewer samples far out than the simulation has in sensor {comparison.info.sensors[sensors[0]]}"
     return TestResult("spike", sidak(min(p_fewer, p_value), 2), words, sensors=sensors, levels=(1,), time_s=place)
+
+
+def fewer_outliers_p_value(comparison: Comparison) -> float:
+    """p value of as few outliers in any sensor as the recording has beside the simulation's."""
+    fewer = _fewer_p_values(comparison)
+    return sidak(float(fewer.min()), len(fewer))
 
 
 def spike_p_value(comparison: Comparison) -> float:
@@ -81,6 +87,7 @@ def spike_p_values(comparison: Comparison) -> Tensor:
     return torch.cat([torch.where(gaussian, p_values[:-1], predicted), together[None]])
 
 
+@derived
 def _fewer_p_values(comparison: Comparison) -> Tensor:
     """p values of as few outliers in each sensor as the recording has beside the simulation's, `(sensor,)`."""
     gaussian = gaussian_sensors(comparison.reference)

@@ -192,7 +192,7 @@ def _tones(comparison: Comparison) -> list[FittedTone]:
     left, scan, tones = comparison.recording, ring_downs(comparison), list[FittedTone]()
     # Scans, tones that are told apart, and cells of a scan that are no ring-down: what lasts has many of them.
     rounds, most, most_refused, most_waves, waves = 4, 48, 4, 4, 0
-    mostly, rings = 0.8, 0.3  # of the energy; cycles in a time constant
+    mostly = 0.8  # of the energy
     line = moving_line(comparison.observed)
     for _ in range(rounds):
         new, by_chance, refused = list[FittedTone](), math.log(scan.n_cells), 0
@@ -209,7 +209,7 @@ def _tones(comparison: Comparison) -> list[FittedTone]:
             found = _only(around.fitted(found.tone, which), which)
             if float(found.log_ratio.sum()) < least or _faint(found, tones + new):
                 continue
-            if found.tone.frequency * found.tone.tau < rings:  # a step, a drift, a bias that swings
+            if not _rings(found):
                 refused += 1
                 continue
             # Of a line there is more before and after; knocks one after the other look like one that comes and goes.
@@ -217,15 +217,23 @@ def _tones(comparison: Comparison) -> list[FittedTone]:
                 waves += 1
                 continue
             rung = _ring_down(around, found, which)
+            if not all(map(_rings, rung)):
+                rung = []
             left = left - sum(_path(one, comparison.n_samples) for one in rung)
             new += rung
             refused += not rung
         if not new:
             return tones
-        tones = _one_by_one(comparison, tones + new)
+        tones = [tone for tone in _one_by_one(comparison, tones + new) if _rings(tone)]
         left = comparison.recording - sum(_path(tone, comparison.n_samples) for tone in tones)
         scan = scanned_ring_downs(whitened(left, comparison.base))
     return tones
+
+
+def _rings(found: FittedTone) -> bool:
+    """Whether it goes up and down before it has died away: else it is a step, a drift, a bias that swings."""
+    least = 0.3  # cycles in a time constant
+    return found.tone.frequency * found.tone.tau >= least
 
 
 def _ring_down(around: Surroundings, found: FittedTone, sensors: Sequence[int]) -> list[FittedTone]:

@@ -202,6 +202,13 @@ class Spikes(Mechanism):
         outliers = self._outliers(comparison, expected.correctable()[0])
         return comparison.with_recording(predicted(comparison.observed, outliers, generator))
 
+    def replaced(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
+        """A record `(sensor, time)` without outliers, which are drawn by their probabilities, with noise instead."""
+        comparison = Comparison.of(info, signal, signal[None])
+        likely = self._likely(comparison, left_out(comparison.observed).correctable()[0])
+        draws = torch.rand(likely.shape, generator=generator, dtype=torch.float64)
+        return predicted(comparison.observed, (draws < likely) & (self.rate > 0)[:, None], generator)
+
     def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
         pictures.tails(ax, comparison, sensor)
 
@@ -219,10 +226,14 @@ class Spikes(Mechanism):
 
     def _outliers(self, comparison: Comparison, error: Tensor) -> Tensor:
         """Samples that are outliers more likely than not by their errors, `(sensor, time)`."""
+        return (self.rate > 0)[:, None] & (self._likely(comparison, error) > 0.5)
+
+    def _likely(self, comparison: Comparison, error: Tensor) -> Tensor:
+        """Probability that samples are outliers, by their errors: `(sensor, time)`, or `(1, time)` of shocks."""
         z, laws = error / left_out(comparison.observed).sd[0][:, None], self._laws(comparison)
         if self.together:
-            return (self.rate[:, None] > 0) & (shock_posterior(z, laws) > 0.5)
-        return torch.stack([law.posterior(row) > 0.5 for row, law in zip(z, laws, strict=True)])
+            return shock_posterior(z, laws)[None]
+        return torch.stack([law.posterior(row) for row, law in zip(z, laws, strict=True)])
 
 
 def _gains(z: Tensor, laws: list[Outliers]) -> Tensor:

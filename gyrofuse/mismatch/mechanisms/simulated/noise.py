@@ -12,13 +12,13 @@ from torch import Tensor
 from gyrofuse.mismatch.detectors.spectra.peaks import strongest_peak
 from gyrofuse.mismatch.likelihoods.spectra.data import reference_noise, shared_ordinates
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
+from gyrofuse.mismatch.mechanisms.simulated.exchanged import exchanged
 from gyrofuse.mismatch.mechanisms.spectra.bumps.oscillation import Mode, OscillationOnTop
 from gyrofuse.mismatch.mechanisms.spectra.bumps.resonance import Resonance
 from gyrofuse.mismatch.mechanisms.spectra.bumps.wandering_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
 from gyrofuse.mismatch.mechanisms.spectra.spectral import Addition, Spectral
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
-from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.filters import mixed
 from gyrofuse.mismatch.signals.folds import spectral_gains
 from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum
@@ -45,7 +45,7 @@ class SimulatedNoise(Spectral):
         # Where a model's numbers were estimated, what it has too much of may be their error.
         if comparison.reference.uncertainty is not None:
             return None
-        other = _exchanged(comparison)
+        other = exchanged(comparison)
         if not cls.may_be_there(comparison, other, level):
             return None
         found = cls.kind.detect_and_fit(other, level)
@@ -234,21 +234,6 @@ class SimulatedCommonMode(SimulatedNoise):
         simulated, recorded = shared_ordinates(comparison)
         has = self.added.gain != 0
         return 2 * float(recorded[has].sum()) < float(simulated[has].sum())
-
-
-@derived
-def _exchanged(comparison: Comparison) -> Comparison:
-    """The simulation in the place of the recording, cut to the length of its records, and the other way round."""
-    simulation, recording = comparison.reference.steady, comparison.observed.steady
-    n = simulation.shape[-1]
-    count = recording.shape[-1] // n
-    records = recording[0, :, : count * n].unflatten(-1, (count, n)).movedim(1, 0)
-    info = replace(comparison.info, channels={})
-    made = Comparison.of(info, simulation[0], records)
-    varies = comparison.reference.level_variance
-    sides = (replace(side, level_variance=varies) for side in (made.observed, made.reference))
-    observed, reference = sides
-    return replace(made, as_came=observed, observed=observed, reference=reference, seed=comparison.seed)
 
 
 def _may_bulge(comparison: Comparison, other: Comparison, level: float) -> bool:

@@ -177,7 +177,13 @@ class StuckSamples(Mechanism):
         keep = estimation_samples(comparison.n_samples, fold)
         if self._single:
             return self._with_share(comparison, keep)
-        return self._estimated(comparison, tuple(self.probability.nonzero()[:, 0].tolist()), keep)
+        found = self._estimated(comparison, tuple(self.probability.nonzero()[:, 0].tolist()), keep)
+        # Where it hung once or twice none may be left: half a row stands for what that says of how often it does.
+        row = torch.tensor(self.row, dtype=torch.float64)
+        seldom = (self.probability > 0) & (found.probability < row / (2 * int(keep.sum())))
+        probability = torch.where(seldom, row / (2 * int(keep.sum())), found.probability)
+        length = torch.where(seldom, row, torch.tensor(found.row, dtype=torch.float64))
+        return replace(found, probability=probability, row=tuple(length.tolist()))
 
     def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
         if self._single:
