@@ -27,6 +27,7 @@ from gyrofuse.mismatch.stats.level_scan import local_level
 from gyrofuse.mismatch.stats.multiplicity import p_value_beyond_reference, sidak
 from gyrofuse.mismatch.stats.tails import (
     LEVELS,
+    Array,
     chi_levels,
     counts_beyond,
     dispersion,
@@ -55,7 +56,7 @@ def outliers_test(comparison: Comparison) -> TestResult:
     p_fewer = fewer_outliers_p_value(comparison)
     place: float | None = at / comparison.info.rate
     if p_fewer < p_value:
-        sensors, place = (int(fewer.argmin()),), None
+        sensors, place = (int(fewer[:-1].argmin()),), None
         words = f"fewer samples far out than the simulation has in sensor {comparison.info.sensors[sensors[0]]}"
     return TestResult("spike", sidak(min(p_fewer, p_value), 2), words, sensors=sensors, levels=(1,), time_s=place)
 
@@ -89,17 +90,24 @@ def spike_p_values(comparison: Comparison) -> Tensor:
 
 @derived
 def _fewer_p_values(comparison: Comparison) -> Tensor:
-    """p values of as few outliers in each sensor as the recording has beside the simulation's, `(sensor,)`."""
+    """p values of as few outliers as the recording has beside the simulation's, `(sensor + 1,)`.
+
+    In each sensor, and counted together.
+    """
     gaussian = gaussian_sensors(comparison.reference)
     if bool(gaussian.all()):
-        return torch.ones(comparison.n_sensors, dtype=torch.float64)
+        return torch.ones(comparison.n_sensors + 1, dtype=torch.float64)
     observed, reference = (_levelled(side).abs() for side in (comparison.observed, comparison.reference))
-    levels = torch.tensor(LEVELS)
-    own, other = (counts_beyond(sizes, levels).sum(0) for sizes in (observed, reference))
-    clumps = np.array([[dispersion(sizes > LEVELS[0])] for sizes in reference.movedim(1, 0)])
+    own, other = (counts_beyond(sizes, torch.tensor(LEVELS)).sum(0) for sizes in (observed, reference))
+    far = (reference > LEVELS[0]).movedim(1, 0)  # (sensor, record, time)
     length = reference[:, 0].numel() / observed[:, 0].numel()
-    p_values = of_all_levels(equal_rates_p_value(other / clumps, own / clumps, length))
-    return torch.where(gaussian, 1.0, p_values)
+
+    def p_values(own: Array, other: Array, clumps: Array) -> Tensor:
+        return of_all_levels(equal_rates_p_value(other / clumps, own / clumps, length))
+
+    each = p_values(own, other, np.array([[dispersion(events)] for events in far]))
+    together = p_values(own.sum(0), other.sum(0), np.array(dispersion(far.sum(0))))
+    return torch.cat([torch.where(gaussian, 1.0, each), together[None]])
 
 
 def _against_gaussian(comparison: Comparison) -> Tensor:
