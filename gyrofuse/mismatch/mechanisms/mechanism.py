@@ -13,13 +13,12 @@ from torch import Tensor
 from gyrofuse._base.axes import clean_name, new_axes_below_each_other
 from gyrofuse._base.deprecation import RenamedAttribute
 from gyrofuse._base.results import cleaned, readable
+from gyrofuse.mismatch.mechanisms.alternative import Alternative
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.folds import sd_of_sum, spectral_gains
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-_BETTER_SD = 2.0  # standard deviations of a difference of two scores, from which an alternative is better
 
 
 class Parameter(NamedTuple):
@@ -222,6 +221,10 @@ class Mechanism:
         """
         raise NotImplementedError
 
+    def is_seen(self, comparison: Comparison) -> bool:
+        """Whether it is seen in a comparison with all other findings repaired; by default it was, and is not asked."""
+        return True
+
     @property
     def follows(self) -> tuple[str, ...]:
         """Auxiliary channels that it follows; none by default."""
@@ -247,24 +250,6 @@ class Mechanism:
     def left_of(self, own: Sequence[Mechanism]) -> tuple[Mechanism, ...]:
         """What is left of effects that the simulation has itself, where it has this one too; by default all."""
         return tuple(own)
-
-
-class Alternative(NamedTuple):
-    """The rival that scores best in the place of a finding, all other findings in.
-
-    Attributes:
-        mechanism: Name of the mechanism.
-        gain: Its held-out score, nats.
-        sd: Standard deviation of the difference between both scores, block by block.
-    """
-
-    mechanism: str
-    gain: float
-    sd: float
-
-    def beats(self, gain: float) -> bool:
-        """Whether it scores higher than the finding's `gain`: beyond chance, and a 1000th to which forms are true."""
-        return self.gain > gain + max(_BETTER_SD * self.sd, abs(gain) / 1000)
 
 
 class Context(NamedTuple):

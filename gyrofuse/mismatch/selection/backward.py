@@ -175,7 +175,7 @@ def _pruned(
         for k in reversed(range(len(selected))):
             one = selected[k]
             score, left = _left_out(one, kept, generator)
-            if score.confirms(one.finding.p_value):
+            if score.confirms(one.finding.p_value) and (left is one.before or one.finding.effect.is_seen(left)):
                 kept.insert(0, one.finding)
                 without.insert(0, (score, left))
             else:

@@ -176,9 +176,11 @@ def band_of(found: Recurring, values: Tensor, sd: float) -> Band | None:
     """
     if not math.isfinite(found.above - found.below):  # a band has values on either side
         return None
+    own = _law_beyond(found, values)
+    middle, spread = own or (found.middle, found.spread)
     # What is put out in a wide band has nearly all of the values, and their scatter is not that of what it took.
-    if _leaves_gap(found, found.spread) or (sd > 0 and _leaves_gap(found, sd)):
-        return Band(*_limits(found), float(values.mean()), False)
+    if any(_leaves_gap(found, *law) for law in ((middle, spread), (found.middle, found.spread), (found.middle, sd))):
+        return Band(*_limits(found), middle, False)
     return _subtracted(found, values, sd)
 
 
@@ -220,16 +222,30 @@ def _limits(found: Recurring) -> tuple[float, float, float]:
     return middle, low, high
 
 
-def _leaves_gap(found: Recurring, sd: float) -> bool:
+def _law_beyond(found: Recurring, values: Tensor) -> tuple[float, float] | None:
+    """Mean and sd of the normal law that has as many values on either side of a band; None of a narrow one."""
+    n, reach, narrow = len(values), found.reach, 0.2  # sd
+    below, above = (int((sign * (values - found.value) >= reach).sum()) for sign in (-1, 1))
+    z = float(stats.norm.ppf(below / n)), float(stats.norm.isf(above / n))
+    if not narrow < z[1] - z[0] < math.inf:
+        return None
+    sd = 2 * reach / (z[1] - z[0])
+    return found.value - sd * (z[0] + z[1]) / 2, sd
+
+
+def _leaves_gap(found: Recurring, middle: float, sd: float) -> bool:
     """Whether as many samples are missing around the value as returned to it: it is not one that was filled in.
 
     The number missing follows from the density beside the band, as a normal law has it within; other laws are within a
     factor of 1.5. The nearest value that is left lies beyond the band by one on average.
     """
-    law, reach = stats.norm(found.middle, sd), found.reach
+    if sd <= 0:
+        return False
+    law, reach = stats.norm(middle, sd), found.reach
     ends = found.value - reach, found.value + reach
-    beside = float(law.pdf(ends[0]) + law.pdf(ends[1])) / 2
-    wide = float(law.cdf(ends[1]) - law.cdf(ends[0])) / beside if beside > 0 else 2 * reach
+    each = [max(float(law.pdf(end)), 1e-300) for end in ends]
+    beside = 2 / (1 / each[0] + 1 / each[1])  # as many values on either side lie in stretches as long as they are rare
+    wide = float(law.cdf(ends[1]) - law.cdf(ends[0])) / beside
     missing = max(wide, 2 * reach) * found.density
     least = found.times * stats.f.ppf(CERTAIN, 2 * found.effective_samples, 2 * found.times)
     most = found.samples * stats.f.isf(CERTAIN, 2 * found.effective_samples, 2 * found.samples)

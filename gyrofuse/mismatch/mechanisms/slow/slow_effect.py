@@ -149,6 +149,12 @@ class SlowEffect(Mechanism, SlowTemplates):
         scan = slow_analysis(comparison).scan(self.name)
         return self if scan is None else replace(self, log_factors=scan.fit.log_factors)
 
+    def is_seen(self, comparison: Comparison) -> bool:
+        """Whether noise that was found later, as slow as it is, leaves it as unlikely."""
+        analysis = slow_analysis(comparison)
+        scan = analysis.scan(self.name)
+        return scan is not None and (scan.p_value <= _STRONG or analysis.several_steps is not None)
+
     def _whitened(self, comparison: Comparison) -> tuple[Tensor, Tensor, Tensor]:
         """Whitened differences of block means: of the data `(sensor, difference)`, of paths and of slow cosines.
 

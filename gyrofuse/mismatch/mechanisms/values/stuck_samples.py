@@ -150,7 +150,8 @@ class StuckSamples(Mechanism):
         """Samples that are none of their own, `(sensor, time)`."""
         if not self._single:
             return repeats(comparison).same
-        return comparison.recording == torch.tensor(self.filler, dtype=torch.float64)[:, None]
+        held = comparison.recording == torch.tensor(self.filler, dtype=torch.float64)[:, None]
+        return held & (self.probability > 0)[:, None]
 
     @classmethod
     def _estimated(cls, comparison: Comparison, sensors: tuple[int, ...], keep: Tensor) -> StuckSamples:
