@@ -98,26 +98,29 @@ def monte_carlo_p_value(p_value: float, among: Tensor) -> float:
     return (len(excess) + 1) / (len(scores) + 1) * _further(own - threshold, float(excess.sum()), len(excess))
 
 
-def p_value_beyond_largest(own: float, among: Tensor, times_as_many: float = 1.0) -> float:
-    """p value of the largest log ratio of many cells, by the largest ones of another record's.
+def p_value_beyond_largest(own: Tensor, among: Tensor, times_as_many: float = 1.0) -> float:
+    """p value of the largest log ratios of many cells, by the largest ones of another record's.
 
     Their tail is exponential, of rate one where they are as independent as was thought, and of a lower one where the
     noise of both records is heavy-tailed or wanders: half of the ones given, forty at most, tell. Fewer than ten count
-    as ten, the others of rate one.
+    as ten, the others of rate one. Of one to four of the largest together those that are least likely count.
 
     Args:
-        own: The largest log ratio, nats.
+        own: Log ratios of cells, `(cell,)`, the largest first, nats.
         among: The largest ones of the other record, one of each stretch of cells that belong together, `(cell,)`.
         times_as_many: Cells of the record over those of the other one.
     """
-    k, few = min(len(among) // 2, 40), 10
+    k, few, most = min(len(among) // 2, 40), 10, 4
     if k == 0:
-        return math.exp(-max(own, 0.0))
+        return math.exp(-max(float(own[0]), 0.0)) if len(own) else 1.0
     largest = among.topk(k + 1).values
     total = max(float((largest[:k] - largest[k]).sum()), float(k)) + max(few - k, 0)
-    return min(times_as_many * k * _further(max(own - float(largest[k]), 0.0), total, max(k, few)), 1.0)
+    beyond = (own[:most] - largest[k]).clamp(min=0).cumsum(0).tolist()
+    # As many cells as tuples of so many may be those.
+    p_values = [(times_as_many * k) ** j * _further(b, total, max(k, few)) for j, b in enumerate(beyond, 1)]
+    return sidak(min([1.0, *p_values]), max(len(p_values), 1))
 
 
 def _further(beyond: float, total: float, n: int) -> float:
-    """Probability that a further exponential value is beyond one, where so many have that total."""
+    """Probability that further exponential values are beyond some of that sum, where so many have that total."""
     return (1 + beyond / total) ** -n

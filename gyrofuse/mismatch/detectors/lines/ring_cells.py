@@ -64,7 +64,7 @@ class RingScan(NamedTuple):
 def p_value_beside(own: RingScan, simulated: RingScan) -> float:
     """p value of a scan of the recording beside one of the simulation, which may ring itself."""
     strongest = torch.tensor([cell.log_ratio for cell in simulated.cells], dtype=torch.float64)
-    largest = max((cell.log_ratio for cell in own.cells), default=0.0)
+    largest = torch.tensor(sorted((cell.log_ratio for cell in own.cells), reverse=True), dtype=torch.float64)
     times_as_many = own.n_cells / max(simulated.n_cells, 1)
     beyond_all = p_value_beyond_reference(own.p_value, simulated.p_value)
     return max(beyond_all, p_value_beyond_largest(largest, strongest, times_as_many))
