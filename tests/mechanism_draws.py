@@ -13,7 +13,6 @@ from torch import Tensor
 
 import gyrofuse as gf
 from gyrofuse.mismatch.likelihoods.spectra.filter_forms import filter_strength
-from gyrofuse.mismatch.mechanisms.coherence_remainder import CoherenceRemainder
 from gyrofuse.mismatch.mechanisms.regimes.channel_noise import ChannelNoise
 from gyrofuse.mismatch.mechanisms.regimes.chirp import Chirp
 from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
@@ -24,7 +23,9 @@ from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
 from gyrofuse.mismatch.mechanisms.regimes.telegraph import RandomTelegraph
 from gyrofuse.mismatch.mechanisms.regimes.tone_in_spells import ToneInSpells
 from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
-from gyrofuse.mismatch.mechanisms.remainder import Remainder
+from gyrofuse.mismatch.mechanisms.remainders.coherence import CoherenceRemainder
+from gyrofuse.mismatch.mechanisms.remainders.slow import SlowRemainder
+from gyrofuse.mismatch.mechanisms.remainders.spectrum import Remainder
 from gyrofuse.mismatch.mechanisms.signals.channel_coupling import ChannelCoupling
 from gyrofuse.mismatch.mechanisms.signals.channel_transfer import ChannelTransfer
 from gyrofuse.mismatch.mechanisms.signals.clock import ClockSkew
@@ -46,7 +47,6 @@ from gyrofuse.mismatch.mechanisms.simulated.spikes import SimulatedSpikes
 from gyrofuse.mismatch.mechanisms.slow.bias_oscillation import BiasOscillation
 from gyrofuse.mismatch.mechanisms.slow.late_warm_up import LateWarmUp
 from gyrofuse.mismatch.mechanisms.slow.ramp import Ramp
-from gyrofuse.mismatch.mechanisms.slow.slow_remainder import SlowRemainder
 from gyrofuse.mismatch.mechanisms.slow.step import Step
 from gyrofuse.mismatch.mechanisms.slow.temperature import TemperatureDrift
 from gyrofuse.mismatch.mechanisms.slow.warm_up import Decay, WarmUpTransient

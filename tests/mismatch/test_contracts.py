@@ -20,13 +20,13 @@ from torch import Tensor
 import gyrofuse as gf
 from gyrofuse.cli.reading import read_model
 from gyrofuse.mismatch.mechanisms.catalogue import CATALOGUE
-from gyrofuse.mismatch.mechanisms.coherence_remainder import CoherenceRemainder
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
 from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
+from gyrofuse.mismatch.mechanisms.remainders.coherence import CoherenceRemainder
+from gyrofuse.mismatch.mechanisms.remainders.slow import SlowRemainder
 from gyrofuse.mismatch.mechanisms.signals.time_scale import TimeScale
 from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
 from gyrofuse.mismatch.mechanisms.signals.tone_amplitude import ToneSize
-from gyrofuse.mismatch.mechanisms.slow.slow_remainder import SlowRemainder
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.values.sensor_order import SensorOrder

@@ -10,9 +10,9 @@ from scipy import stats
 
 import gyrofuse as gf
 from gyrofuse.mismatch import diagnose
-from gyrofuse.mismatch.mechanisms.coherence_remainder import CoherenceRemainder
-from gyrofuse.mismatch.mechanisms.remainder import Remainder
-from gyrofuse.mismatch.mechanisms.slow.slow_remainder import SlowRemainder
+from gyrofuse.mismatch.mechanisms.remainders.coherence import CoherenceRemainder
+from gyrofuse.mismatch.mechanisms.remainders.slow import SlowRemainder
+from gyrofuse.mismatch.mechanisms.remainders.spectrum import Remainder
 from gyrofuse.mismatch.mechanisms.slow.step import Step
 from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization

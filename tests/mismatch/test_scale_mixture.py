@@ -11,7 +11,8 @@ from scipy import signal as dsp
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse.mismatch.mechanisms.regimes.scale_mixture import ScaleMixture, _Law
+from gyrofuse.mismatch.likelihoods.two_levels import TwoLevels
+from gyrofuse.mismatch.mechanisms.regimes.scale_mixture import ScaleMixture
 from gyrofuse.mismatch.signals.prediction_errors import scaled_innovations
 
 N = 16384
@@ -77,12 +78,12 @@ def test_the_law_is_the_likeliest():
     """Beside a grid of laws around it."""
     z = mixed(7, 0.3, 4.0)[0]
     z = z / z.std()
-    law = _Law.fitted(z)
+    law = TwoLevels.fitted(z)
     best = float(torch.logaddexp(*law.log_densities(z)).sum())
     for share in (0.95, 1.0, 1.05):
         for small in (0.97, 1.0, 1.03):
             for large in (0.97, 1.0, 1.03):
-                other = _Law(law.share * share, law.small * small, law.large * large)
+                other = TwoLevels(law.share * share, law.small * small, law.large * large)
                 assert float(torch.logaddexp(*other.log_densities(z)).sum()) <= best + 1e-6
 
 

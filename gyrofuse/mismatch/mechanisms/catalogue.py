@@ -9,7 +9,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable
 
-from gyrofuse.mismatch.mechanisms.coherence_remainder import CoherenceRemainder
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.mechanisms.regimes.channel_noise import ChannelNoise
 from gyrofuse.mismatch.mechanisms.regimes.chirp import Chirp
@@ -21,7 +20,9 @@ from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
 from gyrofuse.mismatch.mechanisms.regimes.telegraph import RandomTelegraph
 from gyrofuse.mismatch.mechanisms.regimes.tone_in_spells import ToneInSpells
 from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
-from gyrofuse.mismatch.mechanisms.remainder import Remainder
+from gyrofuse.mismatch.mechanisms.remainders.coherence import CoherenceRemainder
+from gyrofuse.mismatch.mechanisms.remainders.slow import SlowRemainder
+from gyrofuse.mismatch.mechanisms.remainders.spectrum import Remainder
 from gyrofuse.mismatch.mechanisms.signals.channel_coupling import ChannelCoupling
 from gyrofuse.mismatch.mechanisms.signals.channel_transfer import ChannelTransfer
 from gyrofuse.mismatch.mechanisms.signals.clock import ClockSkew
@@ -43,7 +44,6 @@ from gyrofuse.mismatch.mechanisms.simulated.spikes import SimulatedSpikes
 from gyrofuse.mismatch.mechanisms.slow.bias_oscillation import BiasOscillation
 from gyrofuse.mismatch.mechanisms.slow.late_warm_up import LateWarmUp
 from gyrofuse.mismatch.mechanisms.slow.ramp import Ramp
-from gyrofuse.mismatch.mechanisms.slow.slow_remainder import SlowRemainder
 from gyrofuse.mismatch.mechanisms.slow.step import Step
 from gyrofuse.mismatch.mechanisms.slow.temperature import TemperatureDrift
 from gyrofuse.mismatch.mechanisms.slow.warm_up import WarmUpTransient

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 from torch import Tensor
@@ -12,70 +12,18 @@ from torch import Tensor
 from gyrofuse.mismatch.detectors.variance.haar_kurtosis import jump_test
 from gyrofuse.mismatch.detectors.variance.normality import gaussian_sensors
 from gyrofuse.mismatch.detectors.variance.outliers import spike_p_value
-from gyrofuse.mismatch.likelihoods.outlier_law import free_gaussian, gaussian, heavy_tailed
+from gyrofuse.mismatch.likelihoods.outlier_law import heavy_tailed
+from gyrofuse.mismatch.likelihoods.two_levels import TwoLevels
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples, held_out_blocks
-from gyrofuse.mismatch.signals.prediction_errors import left_out, median_sd, scaled_innovations
+from gyrofuse.mismatch.signals.prediction_errors import left_out, scaled_innovations
 from gyrofuse.mismatch.stats.limits import Z
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-
-class _Law(NamedTuple):
-    """Normal values of two standard deviations.
-
-    Attributes:
-        share: Probability of the larger one.
-        small, large: Standard deviations.
-    """
-
-    share: float
-    small: float
-    large: float
-
-    def log_densities(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Joint log densities of values with either standard deviation."""
-        return (
-            math.log1p(-self.share) + gaussian(z, self.small**2),
-            math.log(self.share) + gaussian(z, self.large**2),
-        )
-
-    def gains(self, z: Tensor) -> Tensor:
-        """Log likelihood over a normal law of the values' own variance, `(time,)`, nats."""
-        return torch.logaddexp(*self.log_densities(z)) - free_gaussian(z)
-
-    @classmethod
-    def fitted(cls, z: Tensor) -> _Law:
-        """Likeliest law of values `(time,)`, by expectation and maximisation (Dempster, Laird and Rubin, 1977)."""
-        quick, squares = median_sd(z), z.square()
-        law = cls(0.1, float(quick), float((squares.mean() / 0.1).sqrt().maximum(2 * quick)))
-        for _ in range(200):
-            small, large = law.log_densities(z)
-            hit = torch.sigmoid(large - small)
-            share = float(hit.mean().clamp(1e-6, 1 - 1e-6))
-            sds = [float(((w * squares).sum() / w.sum()).sqrt()) for w in (1 - hit, hit)]
-            last, law = law, cls(share, *sds)
-            if abs(math.log(law.share / last.share)) + abs(math.log(law.large / last.large)) < 1e-7:
-                break
-        return law
-
-    def standard_deviations(self, z: Tensor) -> tuple[float, float]:
-        """Of the log odds of the share and of the log ratio, from the outer product of the scores of `(time,)`."""
-        at = (math.log(self.share / (1 - self.share)), math.log(self.small), math.log(self.large / self.small))
-        step = 1e-4
-
-        def moved(number: int, by: float) -> Tensor:
-            odds, small, ratio = (value + by * (k == number) for k, value in enumerate(at))
-            law = _Law(1 / (1 + math.exp(-odds)), math.exp(small), math.exp(small + ratio))
-            return torch.logaddexp(*law.log_densities(z))
-
-        scores = torch.stack([(moved(k, step) - moved(k, -step)) / (2 * step) for k in range(3)])
-        variance = torch.linalg.inv(scores @ scores.mT).diagonal()
-        return float(variance[0].sqrt()), float(variance[2].sqrt())
 
 
 def _lasts(z: Tensor) -> bool:
@@ -117,7 +65,7 @@ class ScaleMixture(Mechanism):
         if p_value > level or not bool(gaussian_sensors(comparison.reference).all()):
             return None
         z = left_out(comparison.observed).white[0]
-        laws = [_Law.fitted(row) for row in z]
+        laws = [TwoLevels.fitted(row) for row in z]
         gains = [float(law.gains(row).sum()) for law, row in zip(laws, z, strict=True)]
         rare = 0.03  # rarer ones are isolated outliers
         better, present = 10.0, 15.0  # nats over another heavy-tailed law, and over normal noise
@@ -156,7 +104,7 @@ class ScaleMixture(Mechanism):
 
     def fit_without(self, comparison: Comparison, fold: int) -> ScaleMixture:
         keep = estimation_samples(comparison.n_samples, fold)
-        laws = [_Law.fitted(row[keep]) for row in left_out(comparison.observed).white[0]]
+        laws = [TwoLevels.fitted(row[keep]) for row in left_out(comparison.observed).white[0]]
         has = self.share > 0
         share, ratio = (
             torch.tensor(values, dtype=torch.float64)
@@ -170,9 +118,9 @@ class ScaleMixture(Mechanism):
         for i, row in enumerate(left_out(comparison.observed).white[0]):
             share, ratio = float(self.share[i]), float(self.ratio[i])
             small = float(row.square().mean().sqrt()) / math.sqrt(1 - share + share * ratio**2)
-            gains = _Law(share, small, ratio * small).gains(row) if share else torch.zeros_like(row)
+            gains = TwoLevels(share, small, ratio * small).gains(row) if share else torch.zeros_like(row)
             if share and not bool(gaussian[i]):  # what else was found may make such values as well
-                gains = gains - _Law.fitted(simulated[i]).gains(row)
+                gains = gains - TwoLevels.fitted(simulated[i]).gains(row)
             rows.append(gains)
         return held_out_blocks(torch.stack(rows), fold).sum((0, -1))
 

@@ -10,7 +10,9 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.detectors.variance.noise_level import whitened_recording
-from gyrofuse.mismatch.detectors.variance.outliers import likely_outliers, spike_p_value
+from gyrofuse.mismatch.detectors.variance.normality import gaussian_sensors
+from gyrofuse.mismatch.detectors.variance.outliers import likely_outliers, spike_p_value, spike_p_values
+from gyrofuse.mismatch.detectors.variance.weak_outliers import WeakOutliers
 from gyrofuse.mismatch.likelihoods.outlier_law import (
     Outliers,
     clustered,
@@ -22,6 +24,7 @@ from gyrofuse.mismatch.likelihoods.outlier_law import (
     shock_posterior,
     shock_scores,
 )
+from gyrofuse.mismatch.likelihoods.two_levels import TwoLevels
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
 from gyrofuse.mismatch.mechanisms.regimes.outlier_limits import with_limits
@@ -43,6 +46,7 @@ _PLAIN = 5.0  # sd: outliers that can be taken off one by one
 _PRESENT, _OWN_LAW = 4.0, 10.0  # nats of a sensor that has the law of all, and of one that has a law of its own
 _UNLIKE = 5.0  # nats for each sensor that has a law of its own
 _LIKELY = 0.8  # probability of being hit
+_SEEN = 0.02  # p value of a sensor's tails
 _ROUNDS, _ROUNDS_AGAIN = 40, 10
 _ISOLATED = 0.03  # more frequent ones are another law of the noise
 
@@ -59,6 +63,8 @@ class Spikes(Mechanism):
         rate: Of spikes, for a sample, `(sensor,)`; 0 where there are none.
         height, spread: Mean and sd of their modulus, unit of the signal, `(sensor,)`.
         together: Whether the sensors concerned are hit at the same time: a shock.
+        beside: Share, smaller and larger standard deviation of the noise beside them in each sensor, in its robust sd,
+            where that is no normal noise; empty where it is.
     """
 
     name: ClassVar[str] = "spikes"
@@ -71,6 +77,7 @@ class Spikes(Mechanism):
     height: OfSensors
     spread: OfSensors
     together: bool
+    beside: tuple[tuple[float, float, float], ...] = ()
 
     @property
     def amplitude(self) -> Tensor:
@@ -82,9 +89,10 @@ class Spikes(Mechanism):
         p_value = spike_p_value(comparison)
         if p_value > level:
             return None
-        z = left_out(comparison.observed).z[0]
+        beside = _noise_beside(comparison)
+        z = _normal_scores(left_out(comparison.observed).z[0], beside)
         laws = [fitted(row) for row in z]
-        gains = _gains(z, laws).sum(-1)
+        gains = _gains(z, laws).sum(-1) - _of_the_simulation(comparison, beside)
         hit = tuple((gains > _PRESENT).nonzero()[:, 0].tolist())
         weak = likely_outliers(comparison)
         if weak is not None and not weak.shock and weak.apart > -math.log(level):
@@ -92,16 +100,19 @@ class Spikes(Mechanism):
         if hit:  # what the law of all of them is likelier in has it, however little that gains by itself
             as_others = _gains(z, _shared(z, laws, hit)).sum(-1)
             hit = tuple(i for i in range(comparison.n_sensors) if float(as_others[i]) > 0 or float(gains[i]) > _OWN_LAW)
+        if beside:  # else tails that the simulation has as well would count
+            hit = tuple(i for i in hit if float(spike_p_values(comparison)[i]) < _SEEN)
         apart = float(gains[list(hit)].sum())
         laws = _alike(z, laws, hit)
         gain = float(_gains(z, laws)[list(hit)].sum())
-        shock = _shock(comparison, laws, hit)
+        shock = _shock(z, likely_outliers(comparison), laws, hit)
         together = shock is not None and shock[1] > gain
         if shock is not None and together:
             laws, gain = shock
             hit = tuple(i for i, law in enumerate(laws) if law.rate > 0)
         frequent = any(laws[i].rate > _ISOLATED for i in hit)
-        if not hit or frequent or clustered(whitened_recording(comparison)[list(hit)]):
+        white = _normal_scores(whitened_recording(comparison), beside)
+        if not hit or frequent or clustered(white[list(hit)]):
             return None
         n_laws = 1 if together else _n_laws(laws, hit)
         if max(gain - _LAW * n_laws, apart - _LAW * len(hit)) < _heavy_tailed(z, hit) + _RARE:
@@ -109,8 +120,8 @@ class Spikes(Mechanism):
         rival = _louder(comparison)
         if rival > gain + _ALIKE:
             return None
-        effect = cls._of(comparison, hit, laws, together)
-        parameters = cls._parameters(comparison, hit, laws if together else _limited(z, laws, hit), together)
+        effect = cls._of(comparison, hit, laws, together, beside)
+        parameters = effect._parameters(comparison, hit, laws if together else _limited(z, laws, hit))
         alternatives = [
             name
             for name, alike in (
@@ -139,40 +150,48 @@ class Spikes(Mechanism):
         )
 
     @classmethod
-    def _of(cls, comparison: Comparison, hit: tuple[int, ...], laws: list[Outliers], together: bool) -> Spikes:
+    def _of(
+        cls,
+        comparison: Comparison,
+        hit: tuple[int, ...],
+        laws: list[Outliers],
+        together: bool,
+        beside: tuple[tuple[float, float, float], ...],
+    ) -> Spikes:
         rows = [laws[i] if i in hit else Outliers.none() for i in range(comparison.n_sensors)]
-        rate, height, spread = (
-            torch.tensor([getattr(row, name) for row in rows], dtype=torch.float64)
-            for name in ("rate", "height", "spread")
-        )
+        ends = [
+            [noise.of_normal_score(row.height + sign * row.spread) for sign in (-1, 1)]
+            for row, noise in zip(rows, _noise(beside, comparison.n_sensors), strict=True)
+        ]
+        low, high = torch.tensor(ends, dtype=torch.float64).unbind(-1)
+        rate = torch.tensor([row.rate for row in rows], dtype=torch.float64)
         sd = left_out(comparison.observed).sd[0]
-        return cls(rate, height * sd, spread * sd, together)
+        return cls(rate, (low + high) / 2 * sd, (high - low) / 2 * sd, together, beside)
 
-    @staticmethod
-    def _parameters(
-        comparison: Comparison, hit: tuple[int, ...], laws: list[Outliers], together: bool
-    ) -> dict[str, Parameter]:
+    def _parameters(self, comparison: Comparison, hit: tuple[int, ...], laws: list[Outliers]) -> dict[str, Parameter]:
         per_hour, sd, parameters = comparison.info.rate * _HOUR, left_out(comparison.observed).sd[0], {}
+        noise = _noise(self.beside, comparison.n_sensors)
         for i in hit:
-            law, scale = laws[i], float(sd[i])
+            law = laws[i]
             low, high = law.rate_limits
-            parameters["rate" if together else f"rate[{i}]"] = Parameter(
+            parameters["rate" if self.together else f"rate[{i}]"] = Parameter(
                 law.rate * per_hour, low * per_hour, high * per_hour, "1/h"
             )
-            low, high = law.amplitude_limits
-            parameters[f"amplitude[{i}]"] = Parameter(
-                law.amplitude * scale, low * scale, high * scale, comparison.info.measure
+            size, low, high = (
+                noise[i].of_normal_score(score) * float(sd[i]) for score in (law.amplitude, *law.amplitude_limits)
             )
+            parameters[f"amplitude[{i}]"] = Parameter(size, low, high, comparison.info.measure)
         return parameters
 
     def fit_without(self, comparison: Comparison, fold: int) -> Spikes:
         keep = estimation_samples(comparison.n_samples, fold)
-        z = left_out(comparison.observed).z[0]
+        z = _normal_scores(left_out(comparison.observed).z[0], self.beside)
         hit = tuple(self.rate.nonzero()[:, 0].tolist())
         if self.together:
-            return self._of(comparison, hit, fitted_shock(z[:, keep], self._laws(comparison), _ROUNDS_AGAIN), True)
+            laws = fitted_shock(z[:, keep], self._laws(comparison), _ROUNDS_AGAIN)
+            return self._of(comparison, hit, laws, True, self.beside)
         laws = [fitted(row[keep]) if i in hit else Outliers.none() for i, row in enumerate(z)]
-        return self._of(comparison, hit, _alike(z[:, keep], laws, hit), False)
+        return self._of(comparison, hit, _alike(z[:, keep], laws, hit), False, self.beside)
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
         def draw(kind: str, shape: tuple[int, ...]) -> Tensor:
@@ -213,16 +232,20 @@ class Spikes(Mechanism):
         pictures.tails(ax, comparison, sensor)
 
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
-        z, laws = left_out(comparison.observed).z[0], self._laws(comparison)
+        z, laws = _normal_scores(left_out(comparison.observed).z[0], self.beside), self._laws(comparison)
         if self.together:
             return held_out_blocks(_shock_gains(z, laws), fold).sum(-1)
         laws = [law.scaled(row) for row, law in zip(z, laws, strict=True)]
         return held_out_blocks(_gains(z, laws) * (self.rate[:, None] > 0), fold).sum((0, -1))
 
     def _laws(self, comparison: Comparison) -> list[Outliers]:
-        sd = left_out(comparison.observed).sd[0]
-        numbers = torch.stack([self.rate, self.height / sd, self.spread / sd], -1).tolist()
-        return [Outliers(*row) for row in numbers]
+        """In standard normal scores."""
+        sd, laws = left_out(comparison.observed).sd[0], []
+        ends = torch.stack([self.height - self.spread, self.height + self.spread], -1) / sd[:, None]
+        for rate, own, noise in zip(self.rate.tolist(), ends, _noise(self.beside, len(sd)), strict=True):
+            low, high = noise.normal_scores(own).tolist()
+            laws.append(Outliers(rate, (low + high) / 2, (high - low) / 2))
+        return laws
 
     def _outliers(self, comparison: Comparison, error: Tensor) -> Tensor:
         """Samples that are outliers more likely than not by their errors, `(sensor, time)`."""
@@ -230,10 +253,46 @@ class Spikes(Mechanism):
 
     def _likely(self, comparison: Comparison, error: Tensor) -> Tensor:
         """Probability that samples are outliers, by their errors: `(sensor, time)`, or `(1, time)` of shocks."""
-        z, laws = error / left_out(comparison.observed).sd[0][:, None], self._laws(comparison)
+        z = _normal_scores(error / left_out(comparison.observed).sd[0][:, None], self.beside)
+        laws = self._laws(comparison)
         if self.together:
             return shock_posterior(z, laws)[None]
         return torch.stack([law.posterior(row) for row, law in zip(z, laws, strict=True)])
+
+
+def _noise_beside(comparison: Comparison) -> tuple[tuple[float, float, float], ...]:
+    """Two levels that the noise has in each sensor, where the simulation's is not normal in all of them.
+
+    Those of the recording, within the largest value of the simulation: numbers of its noise may be a little off there.
+    """
+    gaussian, z = gaussian_sensors(comparison.reference), left_out(comparison.reference).z.movedim(0, 1).flatten(1)
+    if bool(gaussian.all()):
+        return ()
+    largest, own = z.abs().amax(-1), left_out(comparison.observed).z[0]
+    normal = TwoLevels(0.0, 1.0, 1.0)
+    laws = [
+        normal if is_normal else TwoLevels.fitted(row[row.abs() <= most])
+        for is_normal, row, most in zip(gaussian, own, largest, strict=True)
+    ]
+    return tuple((law.share, law.small, law.large) for law in laws)
+
+
+def _of_the_simulation(comparison: Comparison, beside: tuple[tuple[float, float, float], ...]) -> Tensor:
+    """What outliers gain in the simulation by itself, `(sensor,)`, nats: its noise has not quite two levels."""
+    if not beside:
+        return torch.zeros(comparison.n_sensors, dtype=torch.float64)
+    z = _normal_scores(left_out(comparison.reference).z.movedim(0, 1).flatten(1), beside)
+    gains = _gains(z, [fitted(row) for row in z]).sum(-1) * comparison.n_samples / z.shape[-1]
+    return torch.tensor([gain if own[0] else 0.0 for gain, own in zip(gains.tolist(), beside, strict=True)])
+
+
+def _noise(beside: tuple[tuple[float, float, float], ...], n_sensors: int) -> list[TwoLevels]:
+    return [TwoLevels(*own) for own in beside] or [TwoLevels(0.0, 1.0, 1.0)] * n_sensors
+
+
+def _normal_scores(z: Tensor, beside: tuple[tuple[float, float, float], ...]) -> Tensor:
+    """Values `(sensor, time)` as standard normal ones that are as unlikely beside that noise."""
+    return torch.stack([noise.normal_scores(row) for row, noise in zip(z, _noise(beside, len(z)), strict=True)])
 
 
 def _gains(z: Tensor, laws: list[Outliers]) -> Tensor:
@@ -286,9 +345,10 @@ def _limited(z: Tensor, laws: list[Outliers], hit: tuple[int, ...]) -> list[Outl
     return limited
 
 
-def _shock(comparison: Comparison, apart: list[Outliers], hit: tuple[int, ...]) -> tuple[list[Outliers], float] | None:
+def _shock(
+    z: Tensor, weak: WeakOutliers | None, apart: list[Outliers], hit: tuple[int, ...]
+) -> tuple[list[Outliers], float] | None:
     """Laws of outliers that hit several sensors at once, and what they gain, nats."""
-    z, weak = left_out(comparison.observed).z[0], likely_outliers(comparison)
     starts = [(hit, [law._replace(rate=max((apart[i].rate for i in hit), default=0.0)) for law in apart])]
     if weak is not None and weak.shock:
         likely = tuple((weak.sensors > 0.5).nonzero()[:, 0].tolist())

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.mechanisms import pictures
-from gyrofuse.mismatch.mechanisms.remainder import without_fold
+from gyrofuse.mismatch.mechanisms.remainders.spectrum import without_fold
 from gyrofuse.mismatch.mechanisms.spectra.spectral import Spectral
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import Dims

@@ -1,0 +1,1 @@
+"""What is left of a difference that has no name."""
