@@ -176,8 +176,7 @@ def band_of(found: Recurring, values: Tensor, sd: float) -> Band | None:
     """
     if not math.isfinite(found.above - found.below):  # a band has values on either side
         return None
-    own = _law_beyond(found, values)
-    middle, spread = own or (found.middle, found.spread)
+    middle, spread = _law_beyond(found, values, sd) or (found.middle, found.spread)
     # What is put out in a wide band has nearly all of the values, and their scatter is not that of what it took.
     if any(_leaves_gap(found, *law) for law in ((middle, spread), (found.middle, found.spread), (found.middle, sd))):
         return Band(*_limits(found), middle, False)
@@ -222,15 +221,18 @@ def _limits(found: Recurring) -> tuple[float, float, float]:
     return middle, low, high
 
 
-def _law_beyond(found: Recurring, values: Tensor) -> tuple[float, float] | None:
-    """Mean and sd of the normal law that has as many values on either side of a band; None of a narrow one."""
-    n, reach, narrow = len(values), found.reach, 0.2  # sd
+def _law_beyond(found: Recurring, values: Tensor, sd: float) -> tuple[float, float] | None:
+    """Mean and sd of the normal law that has as many values on either side of a band.
+
+    None of a narrow band, or where they scatter by far less or more than the simulation's.
+    """
+    n, reach, narrow, alike = len(values), found.reach, 0.2, 2.0  # sd; factor
     below, above = (int((sign * (values - found.value) >= reach).sum()) for sign in (-1, 1))
     z = float(stats.norm.ppf(below / n)), float(stats.norm.isf(above / n))
     if not narrow < z[1] - z[0] < math.inf:
         return None
-    sd = 2 * reach / (z[1] - z[0])
-    return found.value - sd * (z[0] + z[1]) / 2, sd
+    own = 2 * reach / (z[1] - z[0])
+    return (found.value - own * (z[0] + z[1]) / 2, own) if sd / alike < own < alike * sd else None
 
 
 def _leaves_gap(found: Recurring, middle: float, sd: float) -> bool:
