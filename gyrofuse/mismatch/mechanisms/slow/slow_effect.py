@@ -153,7 +153,9 @@ class SlowEffect(Mechanism, SlowTemplates):
         """Whether noise that was found later, as slow as it is, leaves it as unlikely."""
         analysis = slow_analysis(comparison)
         scan = analysis.scan(self.name)
-        return scan is not None and (scan.p_value <= _STRONG or analysis.several_steps is not None)
+        if scan is None:
+            return False
+        return scan.p_value <= _STRONG or (scan.family.jumps and analysis.several_steps is not None)
 
     def _whitened(self, comparison: Comparison) -> tuple[Tensor, Tensor, Tensor]:
         """Whitened differences of block means: of the data `(sensor, difference)`, of paths and of slow cosines.
