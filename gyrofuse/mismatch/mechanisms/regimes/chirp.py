@@ -110,10 +110,28 @@ class Chirp(Transient):
 
     def _followed(self, comparison: Comparison) -> Chirp:
         """Fitted to all samples, its frequency straightened as long as that explains more, its ends cut."""
+        first = self._often_straightened(comparison)
+        again = first._going_on()._often_straightened(comparison)
+        return max(first, again, key=lambda fit: fit._gain(comparison))._trimmed(comparison)
+
+    def _often_straightened(self, comparison: Comparison) -> Chirp:
         tried, rounds = [self._fitted(comparison)], 5
         for _ in range(rounds):
             tried.append(tried[-1]._straightened(comparison))
-        return max(tried, key=lambda fit: fit._gain(comparison))._trimmed(comparison)
+        return max(tried, key=lambda fit: fit._gain(comparison))
+
+    def _going_on(self) -> Chirp:
+        """With the frequencies of the outermost knots on a line through those beside them: ends have fewer samples."""
+        outer, several, frequency = 2, 4, self.frequency_hz.clone()
+        if len(frequency) < 2 * (outer + several):
+            return self
+        k = torch.arange(len(frequency), dtype=torch.float64)
+        ends = ((k < outer, slice(outer, outer + several)), (k >= len(k) - outer, slice(-outer - several, -outer)))
+        for end, beside in ends:
+            x, y = k[beside] - k[beside].mean(), frequency[beside]
+            line = y.mean() + (x @ y) / x.square().sum() * (k - k[beside].mean())
+            frequency = torch.where(end, line, frequency)
+        return replace(self, frequency_hz=frequency.clamp(min=0.0))
 
     def _gain(self, comparison: Comparison) -> float:
         """Log likelihood ratio to none, nats."""
