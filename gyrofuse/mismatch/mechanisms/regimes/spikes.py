@@ -69,7 +69,7 @@ class Spikes(Mechanism):
 
     name: ClassVar[str] = "spikes"
     likelihood: ClassVar[str] = "innovations"
-    rivals: ClassVar[tuple[str, ...]] = ("variance_change",)
+    rivals: ClassVar[tuple[str, ...]] = ("variance_change", "pulses")
     separated_by: ClassVar[str] = "more events, or a second sensor on the same supply"
     time_words: ClassVar[str] = "largest at"
     additive: ClassVar[bool] = True
