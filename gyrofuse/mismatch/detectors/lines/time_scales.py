@@ -2,7 +2,8 @@
 
 Statistic: lines of the simulation that are gone and have a line of the recording of about their size at `r f`, `r` as
 the first of them says it. Null law: lines of the recording anywhere, so that each further line meets one within a
-distance by chance with the density of lines times that; over all pairs that may say `r`.
+distance by chance with the density of lines times that, and of any size within a factor of two, in logarithms; over all
+pairs that may say `r`.
 """
 
 from __future__ import annotations
@@ -70,6 +71,7 @@ def common_ratio(comparison: Comparison) -> CommonRatio | None:
     least, most, like = 0.8, 1.25, 2.0  # ratios of rates, and of amplitudes
     ratios = after.frequency / gone.frequency[:, None]  # (line before, line after)
     sizes = after.amplitude.norm(dim=0) / gone.amplitude.norm(dim=0)[:, None]
+    unlike = sizes.log().abs().maximum((1 / (2 * after.nats) + 1 / (2 * gone.nats[:, None])).sqrt())
     possible = (ratios > least) & (ratios < most) & (sizes > 1 / like) & (sizes < like)
     density = len(new) / (most - least)
     for i, j in possible.nonzero().tolist():
@@ -85,9 +87,10 @@ def common_ratio(comparison: Comparison) -> CommonRatio | None:
             continue
         which = meets.nonzero()[:, 0]
         reach = off.maximum(sd.gather(-1, nearest[:, None])[:, 0])[which[which != i]]
-        p_value = min(float((2 * density * reach).clamp(max=1).prod()) * int(possible.sum()), 1.0)
+        at = nearest[which]
+        by_chance = (2 * density * reach).clamp(max=1).prod() * (unlike[which, at] / math.log(like)).clamp(max=1).prod()
+        p_value = min(float(by_chance) * int(possible.sum()), 1.0)
         if best is None or p_value < best.p_value:
-            at = nearest[which]
             weight = (sd[which, at] ** -2) / (sd[which, at] ** -2).sum()
             mean = float((weight * ratios[which, at]).sum())
             best = CommonRatio(
