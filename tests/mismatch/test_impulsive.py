@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from mismatch_draws import LEVEL, NOISE, RATE, SCENE, N, covers, drawn, even, no
 from scipy import fft, optimize, stats
 from scipy.signal import butter, lfilter
 
-from gyrofuse import AR1, RandomWalk, WhiteNoise
+from gyrofuse import AR1, RandomWalk, Recording, WhiteNoise, diagnose
 from gyrofuse.mismatch.detectors.values import values as marginals
 from gyrofuse.mismatch.detectors.variance import haar_kurtosis, noise_level
 from gyrofuse.mismatch.detectors.variance import outliers as impulses
@@ -22,6 +23,7 @@ from gyrofuse.mismatch.mechanisms.regimes import outlier_limits, spikes
 from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
 from gyrofuse.mismatch.mechanisms.regimes.telegraph import RandomTelegraph, _path
 from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
+from gyrofuse.mismatch.mechanisms.simulated.spikes import SimulatedSpikes
 from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.values.stuck_samples import StuckSamples
@@ -405,3 +407,59 @@ def test_outliers_that_only_the_simulation_has_are_told():
     for given in (simulation, signal):  # nothing differs, or the recording has them
         assert impulses.outliers_test(Comparison.of(SCENE, simulation, given[None])).words != found.words
     assert Spikes.detect_and_fit(Comparison.of(SCENE, signal, simulation[None]), LEVEL) is None
+
+
+def student(g: torch.Generator, freedom: int, *shape: int) -> torch.Tensor:
+    chi2 = torch.randn(freedom, *shape, generator=g, dtype=torch.float64).square().sum(0)
+    return torch.randn(*shape, generator=g, dtype=torch.float64) / (chi2 / freedom).sqrt()
+
+
+@pytest.mark.parametrize(("freedom", "off"), [(3, 0.3), (5, 0.1)])
+def test_outliers_beside_heavy_tails_are_spikes_and_these_are_not(freedom: int, off: float):
+    """Both sides have the tails; beyond them the recording has outliers in two of three sensors.
+
+    Two levels are not quite the law of such tails: of the heaviest ones the farthest values count as outliers.
+    """
+    g = torch.Generator().manual_seed(freedom)
+    recording, simulation = (student(g, freedom, 3, N) for _ in range(2))
+    assert Spikes.detect_and_fit(Comparison.of(SCENE, recording, simulation[None]), LEVEL) is None
+    hit = even(3, N, g=g) < 2e-3
+    hit[0] = False
+    recording = recording + hit * 25.0 * (even(3, N, g=g) - 0.5).sign()
+    comparison = Comparison.of(SCENE, recording, simulation[None])
+    found = nominated(comparison, Spikes)
+    assert found.sensors == (1, 2)
+    assert "not at the same time" in found.sentence
+    for i in (1, 2):
+        assert found.parameters[f"amplitude[{i}]"].value == pytest.approx(25.0, rel=off)
+        assert found.parameters[f"rate[{i}]"].value == pytest.approx(2e-3 * RATE * 3600, rel=6 * off)
+    after = found.effect.repair(comparison, g)
+    assert impulses.outliers_test(after).p_value > 1e-4
+
+
+def test_outliers_beside_noise_of_two_levels_are_spikes():
+    """The law of the noise is told first, without them; then they are."""
+    g = torch.Generator().manual_seed(4)
+    simulation = torch.randn(1, N, generator=g, dtype=torch.float64)
+    loud = even(1, N, g=g) < 0.4
+    recording = torch.randn(1, N, generator=g, dtype=torch.float64) * torch.where(loud, 8.0, 1.0) / 5.12
+    recording[0, even(N, g=g) < 1e-3] += 20.0
+    report = diagnose(Recording(recording, rate=RATE, unit="deg/s"), simulation)
+    names = [finding.mechanism for finding in report.findings]
+    assert names[:2] == ["scale_mixture", "spikes"]
+    assert report.findings[0].parameters["ratio[0]"].value == pytest.approx(8.0, rel=0.06)
+    assert report.findings[1].parameters["amplitude[0]"].value == pytest.approx(20.0, rel=0.1)
+
+
+def test_outliers_of_the_simulation_are_counted_in_all_sensors_together():
+    """Too few in each sensor, and plainly too many in eight."""
+    g = torch.Generator().manual_seed(1)
+    info = replace(SCENE, sensors=tuple("abcdefgh"))
+    signal, simulation = (torch.randn(8, N, generator=g, dtype=torch.float64) for _ in range(2))
+    simulation = torch.where(even(8, N, g=g) < 5e-4, 9.0 * simulation.sign(), simulation)
+    comparison = Comparison.of(info, signal, simulation[None])
+    assert impulses.fewer_outliers_p_value(comparison) < 1e-9
+    found = nominated(comparison, SimulatedSpikes)
+    assert found.sensors == tuple(range(8))
+    assert found.sentence.startswith("only the simulation has isolated outliers in all sensors")
+    assert impulses.outliers_test(found.effect.repair(comparison, g)).p_value > 1e-3

@@ -18,6 +18,7 @@ from gyrofuse.mismatch.detectors.lines.ring_downs import ring_down_test, scanned
 from gyrofuse.mismatch.likelihoods.damped_tone import DampedTone, Surroundings
 from gyrofuse.mismatch.mechanisms.regimes.ring_down import RingDown
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.stats.multiplicity import p_value_beyond_largest
 
 N, RATE = 8192, 200.0
 GAINS = torch.tensor([1.0, -0.7, 0.4], dtype=torch.float64)
@@ -243,3 +244,24 @@ def test_a_repaired_simulation_has_knocks_at_random():
     loudest = report.model.simulate(N, batch=(40,), generator=generator(9)).abs().amax((-1, -2))
     # Of two in a record on the average, none has a probability of 14 %.
     assert 0.6 < float((loudest > 7).to(torch.float64).mean()) < 1
+
+
+def test_several_log_ratios_together_are_rarer_than_the_largest():
+    """Of exponential tails: never more often than the p value says, in 2000 records of 1000 cells."""
+    g, n_runs = generator(9), 2000
+    cells = -torch.rand(n_runs, 2, 1000, generator=g, dtype=torch.float64).log()
+    largest = cells.topk(40).values
+    p_values = torch.tensor([p_value_beyond_largest(own, other) for own, other in largest])
+    for level in (0.1, 0.01):
+        assert int((p_values < level).sum()) <= at_most(n_runs, level)
+    other, knocks = largest[0, 1], torch.tensor([22.0, 21.0, 20.0, 19.0], dtype=torch.float64)
+    assert p_value_beyond_largest(knocks, other) < p_value_beyond_largest(knocks[:1], other) / 10
+
+
+def test_a_bias_that_is_lost_and_found_rings_no_more_than_a_step():
+    """Two tones, or two knocks, fitted to a step at the end of a gap: none of them goes up and down."""
+    path = torch.zeros(N, dtype=torch.float64)
+    path[3000:] = 1.0
+    path[3000:3060] = -2.5
+    found = RingDown.detect_and_fit(compared(3.0 * GAINS[:, None] * path, 12), 1e-3)
+    assert found is None or float((found.effect.frequency_hz * found.effect.decay_s).min()) >= 0.3

@@ -507,3 +507,15 @@ def test_block_means_of_the_effect_are_gone():
     finding = best(now)
     left = block_means(finding.effect.remove(now.recording, now.info))
     assert float((left[0, 150:].mean() - left[0, :130].mean()).abs()) < 0.3
+
+
+def test_a_slow_course_has_to_stand_out_of_noise_that_was_found_later():
+    """A step is seen beside the simulation's noise, and of a walk of that size one in some records has as much."""
+    effect = 0.5 * (T > N / 2)
+    seen = comparison(effect)
+    found = Step.detect_and_fit(seen, LEVEL)
+    assert found is not None
+    assert found.effect.is_seen(seen)
+    walk = gf.RandomWalk(1e-2).simulate(N, batch=(3, SENSORS), generator=generator(5)).double()
+    louder = Comparison.of(seen.info, seen.recording, noise(101, 3) + walk)
+    assert not found.effect.is_seen(louder)

@@ -98,3 +98,14 @@ def test_the_simulation_has_its_lines_elsewhere() -> None:
         new, old = (power[round(f / rate * N) + torch.arange(-1, 2)].max() for rate in (208.0, RATE))
         assert float(new) > 10 * float(old)
     assert TimeScale.detect_and_fit(after, 1e-3) is None
+
+
+def test_sizes_that_stay_say_that_two_lines_moved_by_one_factor() -> None:
+    simulation = sampled(8, RATE, {31.0: 0.5, 52.7: 0.4})
+    alike, unlike = (
+        common_ratio(compared(sampled(9, 208.0, {31.0: 0.5 * factor, 52.7: 0.4 / factor}), simulation))
+        for factor in (1.0, 1.6)
+    )
+    assert alike is not None
+    assert unlike is not None
+    assert alike.p_value < unlike.p_value / 10

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.detectors.lines import track_fit, tracks
 from gyrofuse.mismatch.detectors.lines.chirps import chirp_test
+from gyrofuse.mismatch.mechanisms.regimes.chirp import Chirp
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 
 
@@ -110,3 +111,20 @@ def test_pulses_are_no_line_that_moves() -> None:
         signal[:, at : at + 4] += pulse
     comparison = Comparison.of(RecordingInfo(1000.0, "deg/s", ("1", "2", "3")), signal, simulation)
     assert chirp_test(comparison).p_value > 1e-3
+
+
+def test_a_loud_chirp_is_followed_to_its_ends():
+    """Of 100 times the noise: where it begins the course has few samples, and goes on as beside them."""
+    n, rate = 13763, 944.8
+    t = torch.arange(n, dtype=torch.float64) / n
+    low, high = 0.05, 0.42  # cycles per sample
+    path = 10.0 * torch.cos(2 * math.pi * n * (low * t + (high - low) * t.square() / 2))
+    g = torch.Generator().manual_seed(3)
+    recording, simulation = (torch.randn(2, n, generator=g, dtype=torch.float64) for _ in range(2))
+    recording[0] += path
+    info = RecordingInfo(rate, "deg/s", ("a", "b"))
+    found = Chirp.detect_and_fit(Comparison.of(info, recording, simulation[None]), 1e-3)
+    assert found is not None
+    assert isinstance(found.effect, Chirp)
+    left = recording[0] - found.effect.path(n, rate)[0]
+    assert float(left.var()) < 1.3

@@ -389,3 +389,42 @@ def test_rounding_gives_numbers_whatever_its_blur(blur: float, spread: float):
     rounded = _blurred(values, blur)
     assert bool(rounded.isfinite().all())
     assert float((rounded - values).abs().max()) < 1.5
+
+
+def test_a_sensor_that_hung_twice_is_told_wherever_the_blocks_are() -> None:
+    """Both times lie in blocks that are held out together: none is left to estimate how often."""
+    recording, simulation, _ = drawn(33)
+    block = N // 32
+    for at in (9 * block + 100, 21 * block + 100):
+        recording[1, at : at + 60] = -3.0
+    found = nominated(Comparison.of(SCENE, recording, simulation), StuckSamples)
+    score = score_held_out(Comparison.of(SCENE, recording, simulation), found.effect)
+    assert found.sensors == (1,)
+    assert score.confirms(found.p_value)
+
+
+def test_a_dead_band_beside_a_bias_that_the_simulation_has_not() -> None:
+    """What is left of the mean is not that of the values; the sensor with more bias than band has one as well."""
+    recording, simulation, g = drawn(34)
+    bias, width = torch.tensor([[0.9], [1.5], [0.0]], dtype=torch.float64), 1.2
+    biased = recording - recording.mean(-1, keepdim=True) + bias
+    recording = torch.where((biased.abs() < width) & (bias > 0), 0.0, biased)
+    comparison = Comparison.of(SCENE, recording, simulation - simulation.mean(-1, keepdim=True))
+    found = nominated(comparison, DeadBand)
+    assert found.sensors == (0, 1)
+    assert isinstance(found.effect, DeadBand)
+    torch.testing.assert_close(found.effect.centre[:2], bias[:2, 0], atol=0.05, rtol=0.0)
+    built = found.effect.repair(comparison, g)
+    ratio = built.reference.signal[:, :2].std(-1).mean(0) / recording[:2].std(-1)
+    torch.testing.assert_close(ratio, torch.ones_like(ratio), atol=0.03, rtol=0.0)
+
+
+def test_a_value_in_the_place_of_samples_leaves_other_sensors_as_they_are() -> None:
+    recording, simulation, g = drawn(35)
+    recording[1, even(N, g=g) < 0.01] = 0.0
+    recording[2, 5000] = 0.0  # its own
+    comparison = Comparison.of(SCENE, recording, simulation)
+    found = nominated(comparison, StuckSamples)
+    assert found.sensors == (1,)
+    after = found.effect.repair(comparison, g)
+    assert torch.equal(after.recording[[0, 2]], recording[[0, 2]])

@@ -10,7 +10,7 @@ import torch
 from scipy import special
 from torch import Tensor
 
-from gyrofuse.mismatch.likelihoods.outlier_law import free_gaussian, gaussian
+from gyrofuse.mismatch.likelihoods.outlier_law import gaussian
 from gyrofuse.mismatch.signals.prediction_errors import median_sd
 
 
@@ -34,16 +34,22 @@ class TwoLevels(NamedTuple):
         )
 
     def gains(self, z: Tensor) -> Tensor:
-        """Log likelihood over a normal law of the values' own variance, `(time,)`, nats."""
-        return torch.logaddexp(*self.log_densities(z)) - free_gaussian(z)
+        """Log likelihood over a normal law of the values' own variance, `(time,)`, nats; none beyond it."""
+        within = self.within(z)
+        gains = torch.logaddexp(*self.log_densities(z)) - gaussian(z, z[within].square().mean())
+        return torch.where(within, gains, 0.0)
+
+    def within(self, z: Tensor) -> Tensor:
+        """Values `(time,)` that it has more often than once in a hundred such records."""
+        least = 0.01
+        return z.abs() < self.of_normal_score(-float(special.ndtri(least / 2 / len(z))))
 
     @classmethod
     def fitted(cls, z: Tensor) -> TwoLevels:
-        """Likeliest law of values `(time,)`, without those of which it has not one in a hundred such records."""
-        rounds, least = 3, 0.01
-        law = cls._likeliest(z)
+        """Likeliest law of values `(time,)`, without those that lie beyond it."""
+        rounds, law = 3, cls._likeliest(z)
         for _ in range(rounds):
-            within = z.abs() < law.of_normal_score(-float(special.ndtri(least / 2 / len(z))))
+            within = law.within(z)
             if bool(within.all()):
                 break
             law = cls._likeliest(z[within])

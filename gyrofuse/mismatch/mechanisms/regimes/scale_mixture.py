@@ -72,7 +72,7 @@ class ScaleMixture(Mechanism):
         hit = tuple(
             i
             for i, (law, gain) in enumerate(zip(laws, gains, strict=True))
-            if gain > present and rare < law.share < 1 - rare and gain > heavy_tailed(z[i]) + better
+            if gain > present and rare < law.share < 1 - rare and gain > heavy_tailed(z[i][law.within(z[i])]) + better
         )
         if not hit or any(_lasts(z[i]) for i in hit):
             return None
