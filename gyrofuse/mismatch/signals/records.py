@@ -178,18 +178,22 @@ class Records:
     def _levels_alike(self) -> float:
         """Covariance of two sensors' levels over their means, of all pairs: by so much more coherences vary.
 
-        Seen in squares of differences of samples, means over short blocks; chance in them is every sensor's own.
+        Seen in squares of differences of samples: in means over short blocks, in which chance is every sensor's own,
+        or, as where single samples are loud in all sensors at once, in these squares themselves, less what noise in
+        common makes alike in them.
         """
         p = self.signal.shape[-2]
         n = self.signal.shape[-1] // _BLOCK * _BLOCK
         if p < 2 or self.gaussian or n < 2 * _BLOCK:
             return 0.0
-        squares = self.steady[..., :n].diff(append=self.steady[..., n - 1 : n]).square()
-        squares = squares.minimum(_CUT * squares.mean((0, -1))[:, None])
-        level = squares.unflatten(-1, (-1, _BLOCK)).mean(-1)  # (record, sensor, block)
-        relative = level / level.mean(-1, keepdim=True).clamp(min=1e-300) - 1
-        covariance = (relative @ relative.mT).mean(0) / relative.shape[-1]
-        return max(float(covariance.sum() - covariance.trace()) / (p * (p - 1)), 0.0)
+        steps = self.steady[..., :n].diff(append=self.steady[..., n - 1 : n])
+        squares = steps.square()
+        cut = squares.minimum(_CUT * squares.mean((0, -1))[:, None])
+        block = _covariance(cut.unflatten(-1, (-1, _BLOCK)).mean(-1))
+        correlation = (steps @ steps.mT).mean(0)
+        size = correlation.diagonal().clamp(min=1e-300).rsqrt()
+        single = _covariance(squares) - 2 * (size[:, None] * correlation * size).square()
+        return max(*(float(c.sum() - c.trace()) / (p * (p - 1)) for c in (block, single)), 0.0)
 
     @cached_property
     def power(self) -> Tensor:
@@ -256,3 +260,9 @@ class Records:
             # Sums of their own: a difference of sums from the first band on would lose what a filter holds back.
             smooth.append(total[low:high].sum(0) / dof[low:high].sum())
         return torch.stack(smooth)
+
+
+def _covariance(level: Tensor) -> Tensor:
+    """Covariance of levels `(record, sensor, time)` over their means, `(sensor, sensor)`."""
+    relative = level / level.mean(-1, keepdim=True).clamp(min=1e-300) - 1
+    return (relative @ relative.mT).mean(0) / relative.shape[-1]
