@@ -26,6 +26,11 @@ class TwoLevels(NamedTuple):
     small: float
     large: float
 
+    @classmethod
+    def normal(cls) -> TwoLevels:
+        """The law of standard normal values."""
+        return cls(0.0, 1.0, 1.0)
+
     def log_densities(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Joint log densities of values with either standard deviation."""
         return (

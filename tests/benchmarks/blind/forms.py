@@ -329,9 +329,7 @@ def swapped(bench: Bench, nats: float) -> Part:
 
 def simulated_resonance(bench: Bench, nats: float) -> Part:
     """A structure that the simulator lets ring, and the device has not."""
-    part = resonance(bench, nats)
-    assert part.signal is not None
-    return _of_the_simulation(part, part.signal)
+    return _of_the_simulation(resonance(bench, nats))
 
 
 def simulated_source(bench: Bench, nats: float) -> Part:
@@ -339,19 +337,20 @@ def simulated_source(bench: Bench, nats: float) -> Part:
     sensors = bench.some_sensors(2, shared=True)
     gains = bench.gains(sensors) * bench.sigma
     part, size = added(bench, "common_mode", nats, gains[:, None] ** 2 * np.ones_like(bench.spectrum), broad=True)
-    return _of_the_simulation(part, math.sqrt(size) * gains[:, None] * bench.rng.standard_normal(bench.n))
+    return _of_the_simulation(
+        replace(part, signal=math.sqrt(size) * gains[:, None] * bench.rng.standard_normal(bench.n))
+    )
 
 
 def simulated_spikes(bench: Bench, nats: float) -> Part:
     """Outliers that the simulator draws, as a real device of the kind had them, and this one has not."""
-    part = marginal.spikes(bench, nats)
-    assert part.signal is not None
-    return _of_the_simulation(part, part.signal)
+    return _of_the_simulation(marginal.spikes(bench, nats))
 
 
-def _of_the_simulation(part: Part, path: Array) -> Part:
-    """A part that an oracle of the recording does not see."""
-    nats = part.nats
+def _of_the_simulation(part: Part) -> Part:
+    """A part whose signal is the simulation's: an oracle of the recording does not see it."""
+    nats, path = part.nats, part.signal
+    assert path is not None
     return replace(
         part, signal=None, simulation=lambda simulated: simulated + path, llr=lambda recording: nats, form="simulated"
     )

@@ -176,10 +176,12 @@ def band_of(found: Recurring, values: Tensor, sd: float) -> Band | None:
     """
     if not math.isfinite(found.above - found.below):  # a band has values on either side
         return None
-    middle, spread = _law_beyond(found, values, sd) or (found.middle, found.spread)
+    laws = [(found.middle, found.spread), (found.middle, sd)]
+    if (beyond := _law_beyond(found, values, sd)) is not None:
+        laws.insert(0, beyond)
     # What is put out in a wide band has nearly all of the values, and their scatter is not that of what it took.
-    if any(_leaves_gap(found, *law) for law in ((middle, spread), (found.middle, found.spread), (found.middle, sd))):
-        return Band(*_limits(found), middle, False)
+    if any(_leaves_gap(found, *law) for law in laws):
+        return Band(*_limits(found), laws[0][0], False)
     return _subtracted(found, values, sd)
 
 

@@ -265,13 +265,12 @@ def _noise_beside(comparison: Comparison) -> tuple[tuple[float, float, float], .
 
     Those of the recording, within the largest value of the simulation: numbers of its noise may be a little off there.
     """
-    gaussian, z = gaussian_sensors(comparison.reference), left_out(comparison.reference).z.movedim(0, 1).flatten(1)
+    gaussian = gaussian_sensors(comparison.reference)
     if bool(gaussian.all()):
         return ()
-    largest, own = z.abs().amax(-1), left_out(comparison.observed).z[0]
-    normal = TwoLevels(0.0, 1.0, 1.0)
+    largest, own = _simulated(comparison).abs().amax(-1), left_out(comparison.observed).z[0]
     laws = [
-        normal if is_normal else TwoLevels.fitted(row[row.abs() <= most])
+        TwoLevels.normal() if is_normal else TwoLevels.fitted(row[row.abs() <= most])
         for is_normal, row, most in zip(gaussian, own, largest, strict=True)
     ]
     return tuple((law.share, law.small, law.large) for law in laws)
@@ -279,15 +278,23 @@ def _noise_beside(comparison: Comparison) -> tuple[tuple[float, float, float], .
 
 def _of_the_simulation(comparison: Comparison, beside: tuple[tuple[float, float, float], ...]) -> Tensor:
     """What outliers gain in the simulation by itself, `(sensor,)`, nats: its noise has not quite two levels."""
+    gains = torch.zeros(comparison.n_sensors, dtype=torch.float64)
     if not beside:
-        return torch.zeros(comparison.n_sensors, dtype=torch.float64)
-    z = _normal_scores(left_out(comparison.reference).z.movedim(0, 1).flatten(1), beside)
-    gains = _gains(z, [fitted(row) for row in z]).sum(-1) * comparison.n_samples / z.shape[-1]
-    return torch.tensor([gain if own[0] else 0.0 for gain, own in zip(gains.tolist(), beside, strict=True)])
+        return gains
+    z = _normal_scores(_simulated(comparison), beside)
+    for i, (share, _, _) in enumerate(beside):
+        if share:
+            gains[i] = _gains(z[i : i + 1], [fitted(z[i])]).sum() * comparison.n_samples / z.shape[-1]
+    return gains
+
+
+def _simulated(comparison: Comparison) -> Tensor:
+    """Standardised prediction errors of the simulation, `(sensor, time)`, its records one after the other."""
+    return left_out(comparison.reference).z.movedim(0, 1).flatten(1)
 
 
 def _noise(beside: tuple[tuple[float, float, float], ...], n_sensors: int) -> list[TwoLevels]:
-    return [TwoLevels(*own) for own in beside] or [TwoLevels(0.0, 1.0, 1.0)] * n_sensors
+    return [TwoLevels(*own) for own in beside] or [TwoLevels.normal()] * n_sensors
 
 
 def _normal_scores(z: Tensor, beside: tuple[tuple[float, float, float], ...]) -> Tensor:

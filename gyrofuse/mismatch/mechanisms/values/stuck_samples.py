@@ -180,10 +180,10 @@ class StuckSamples(Mechanism):
             return self._with_share(comparison, keep)
         found = self._estimated(comparison, tuple(self.probability.nonzero()[:, 0].tolist()), keep)
         # Where it hung once or twice none may be left: half a row stands for what that says of how often it does.
-        row = torch.tensor(self.row, dtype=torch.float64)
-        seldom = (self.probability > 0) & (found.probability < row / (2 * int(keep.sum())))
-        probability = torch.where(seldom, row / (2 * int(keep.sum())), found.probability)
-        length = torch.where(seldom, row, torch.tensor(found.row, dtype=torch.float64))
+        half = self._length / (2 * int(keep.sum()))
+        seldom = (self.probability > 0) & (found.probability < half)
+        probability = torch.where(seldom, half, found.probability)
+        length = torch.where(seldom, self._length, found._length)
         return replace(found, probability=probability, row=tuple(length.tolist()))
 
     def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
@@ -215,11 +215,17 @@ class StuckSamples(Mechanism):
         source = torch.where(held, 0, torch.arange(n)).cummax(-1).values
         return records.gather(-1, source).view(signal.shape)
 
+    @property
+    def _length(self) -> Tensor:
+        """Mean length of a row, `(sensor,)`."""
+        if self.row:
+            return torch.tensor(self.row, dtype=torch.float64)
+        return 1 / (1 - self.probability.clamp(max=1 - 1e-9))
+
     def _turns(self) -> tuple[Tensor, Tensor]:
         """Probabilities that a row of repeats begins with a sample, and that it ends before the next, `(sensor,)`."""
         p = self.probability.clamp(max=1 - 1e-9)
-        length = torch.tensor(self.row, dtype=torch.float64) if self.row else 1 / (1 - p)
-        length = length.clamp(min=1.0).maximum(p / (1 - p))  # no more rows than samples between them
+        length = self._length.clamp(min=1.0).maximum(p / (1 - p))  # no more rows than samples between them
         return (p / (1 - p) / length).clamp(max=1.0), 1 / length
 
     def _hangs_beside_chance(self, sensor: int) -> bool:
