@@ -334,3 +334,14 @@ def test_coherences_of_noise_that_is_loud_in_all_sensors_at_once_vary_more() -> 
         assert float(mean) == pytest.approx(1.0, abs=0.12)
         assert float((side.dof / side.coherence_dof)[high].max()) < 1 + largest
     assert float((side.dof / side.coherence_dof)[high].min()) > 1.4
+
+
+def test_noise_in_common_varies_as_other_noise_and_shocks_in_common_more() -> None:
+    g, n = torch.Generator().manual_seed(4), 16384
+    root = torch.linalg.cholesky(0.5 * torch.eye(3, dtype=torch.float64) + 0.5)
+    noise = root @ torch.randn(3, n, generator=g, dtype=torch.float64)
+    shocks = 15 * (torch.rand(n, generator=g, dtype=torch.float64) < 1e-3) * torch.randn(3, n, generator=g).double()
+    plain, shocked = (Records(x[None], bands(n)) for x in (noise, noise + shocks))
+    # 0.5^2 times 1.5 by what differences repeat, twice over, in a mean over 16 samples
+    assert float((plain.dof / plain.coherence_dof).max()) < 1.06
+    assert float((shocked.dof / shocked.coherence_dof)[plain.dof > 100].min()) > 3.0

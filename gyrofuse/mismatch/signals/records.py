@@ -180,7 +180,7 @@ class Records:
 
         Seen in squares of differences of samples: in means over short blocks, in which chance is every sensor's own,
         or, as where single samples are loud in all sensors at once, in these squares themselves, less what noise in
-        common makes alike in them.
+        common makes alike in them and twice what chance does.
         """
         p = self.signal.shape[-2]
         n = self.signal.shape[-1] // _BLOCK * _BLOCK
@@ -189,11 +189,14 @@ class Records:
         steps = self.steady[..., :n].diff(append=self.steady[..., n - 1 : n])
         squares = steps.square()
         cut = squares.minimum(_CUT * squares.mean((0, -1))[:, None])
-        block = _covariance(cut.unflatten(-1, (-1, _BLOCK)).mean(-1))
+        block = _alike(cut.unflatten(-1, (-1, _BLOCK)).mean(-1))
         correlation = (steps @ steps.mT).mean(0)
         size = correlation.diagonal().clamp(min=1e-300).rsqrt()
-        single = _covariance(squares) - 2 * (size[:, None] * correlation * size).square()
-        return max(*(float(c.sum() - c.trace()) / (p * (p - 1)) for c in (block, single)), 0.0)
+        shared = 2 * (size[:, None] * correlation * size).square()
+        single = _alike(squares)
+        chance = single.std() / single.numel() ** 0.5
+        noise = (shared.sum() - shared.trace()) / (p * (p - 1)) + 2 * chance
+        return max(float(block.mean()), float(single.mean() - noise), 0.0)
 
     @cached_property
     def power(self) -> Tensor:
@@ -262,7 +265,8 @@ class Records:
         return torch.stack(smooth)
 
 
-def _covariance(level: Tensor) -> Tensor:
-    """Covariance of levels `(record, sensor, time)` over their means, `(sensor, sensor)`."""
+def _alike(level: Tensor) -> Tensor:
+    """Product of two sensors' levels `(record, sensor, time)` over their means, mean of all pairs, `(record, time)`."""
+    p = level.shape[-2]
     relative = level / level.mean(-1, keepdim=True).clamp(min=1e-300) - 1
-    return (relative @ relative.mT).mean(0) / relative.shape[-1]
+    return (relative.sum(-2).square() - relative.square().sum(-2)) / (p * (p - 1))
