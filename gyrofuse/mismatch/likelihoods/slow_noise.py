@@ -267,18 +267,18 @@ def slow_ordinates(signal: Tensor) -> Tensor:
 
 def own_ordinates(comparison: Comparison, side: Records) -> Tensor:
     """Of one side, `(record, sensor, ordinate)`, without what its ends let in where the simulation has little else."""
-    y = slow_ordinates(side.steady)
-    return _without_ends(y) if _ends_let_in(comparison.reference) else y
+    y, let = slow_ordinates(side.steady), _ends_let_in(comparison.reference)
+    return torch.where(let[:, None], _without_ends(y), y) if bool(let.any()) else y
 
 
 @derived
-def _ends_let_in(side: Records) -> bool:
-    """Whether what the ends let in is most of the slowest ordinates, as after a high-pass: the same two numbers."""
+def _ends_let_in(side: Records) -> Tensor:
+    """Sensors `(sensor,)` whose slowest ordinates are mostly let in by the ends, as after a high-pass: two numbers."""
     most, n = 3, side.bands.n_samples
     at = torch.arange(1, _UNSEEN + 1, dtype=torch.float64) / (2 * n)
     f = torch.logspace(-math.log10(2 * n), math.log10(0.5), 1000, dtype=torch.float64)
     own = side.density(at)
-    return bool((let_in(f, side.density(f), at, n).sum(-1) > most * own.sum(-1)).any())
+    return let_in(f, side.density(f), at, n).sum(-1) > most * own.sum(-1)
 
 
 def _without_ends(y: Tensor) -> Tensor:

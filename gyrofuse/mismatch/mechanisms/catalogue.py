@@ -53,6 +53,7 @@ from gyrofuse.mismatch.mechanisms.spectra.bumps.wandering_tone import DriftingTo
 from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
 from gyrofuse.mismatch.mechanisms.spectra.cross_talk import CrossTalk
 from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
+from gyrofuse.mismatch.mechanisms.spectra.high_pass import HighPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.notch import NotchFilter
 from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
@@ -92,6 +93,7 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (
         ParameterShift,
         LowPassFilter,
+        HighPassFilter,
         NotchFilter,
         Resonance,
         DriftingTone,

@@ -242,7 +242,13 @@ def _poles(form: _Form) -> tuple[complex, ...]:
         # With ripples of more than halves it is within them that the power is halved, next to the last of all.
         half = math.cosh(math.acosh(max(1 / ripple, 1.0)) / form.order)
         return tuple(complex(p) / half for p in poles)
-    return tuple(complex(p) for p in signal.butter(form.order, 1.0, analog=True, output="zpk")[1])
+    return butterworth_poles(form.order)
+
+
+@functools.lru_cache(maxsize=16)
+def butterworth_poles(order: int) -> tuple[complex, ...]:
+    """Of Butterworth's analogue prototype, which halves the power at one."""
+    return tuple(complex(p) for p in signal.butter(order, 1.0, analog=True, output="zpk")[1])
 
 
 def _at_rest(form: _Form) -> float:

@@ -169,7 +169,8 @@ def leading_shape(comparison: Comparison) -> Shape | None:
     wider = torch.ones(data.n_sensors, dtype=torch.float64) if fits else _overdispersion(data, chosen)
     seen = [_with_sd(comparison, chosen, i) for i in range(len(chosen.terms))]
     seen = [(term, (local * wider, shared * wider.max())) for term, (local, shared) in seen]
-    first, gain, alone = _first(data, chosen, [term for term, _ in seen])
+    found = [_found_before(term, comparison) for term, _ in seen]
+    first, gain, alone = _first(data, chosen, [term for term, _ in seen], found)
     term, others = chosen.terms[first], _others(chosen, first)
     n_classes = 16.0  # classes and frequencies that compete
     p = sidak(float(stats.chi2.sf(2 * gain, term.n_free(data.ground))), n_classes)
@@ -216,22 +217,31 @@ def _overdispersion(data: Ratios, chosen: Fit) -> Tensor:
     return (1 + 2 * fitness(data, chosen.model).excess.clamp(min=0) / dof).sqrt()
 
 
-def _first(data: Ratios, chosen: Fit, terms: list[Term]) -> tuple[int, float, bool]:
+def _found_before(term: Term, comparison: Comparison) -> bool:
+    """Whether all sensors that a filter acts on have one of its name already: it mends the form of that."""
+    has = term.free.any(0)
+    return any(name == term.name and not bool((has & ~acts).any()) for name, acts in comparison.filters)
+
+
+def _first(data: Ratios, chosen: Fit, terms: list[Term], found_before: list[bool]) -> tuple[int, float, bool]:
     """The term that acts first, what it adds to the log likelihood of the others, nats, and whether they add little.
 
     Not one that gains nothing by itself unless others need it, nor the little that was left for beside a common source
-    or a mode, or, less yet, beside a filter.
+    or a mode, or, less yet, beside a filter. Where one mends the form of a filter that was found before, what is added
+    may as well: other filters come first.
     """
     losses, next_to_nothing = [chosen.gain], 0.01
     if len(terms) > 1:
         losses = [chosen.gain - max(fit(data, _others(chosen, i)).gain, 0.0) for i in range(len(terms))]
     most = max(range(len(terms)), key=lambda i: losses[i])
 
-    def rank(i: int) -> tuple[bool, int, float]:
+    def rank(i: int) -> tuple[bool, bool, int, float]:
+        mends = found_before[i] or (any(found_before) and terms[i].acts != "filter")
         alone = float(log_gain(data, data_model(data, [terms[i]])).sum())
         faint = losses[i] < losses[most] * (next_to_nothing if terms[most].acts == "filter" else 0.1)
         needed = losses[i] > losses[most] / 10
-        return faint or (alone < NEW_TERM_NATS and not needed), _ORDER.index(terms[i].acts), -alone
+        idle = faint or (alone < NEW_TERM_NATS and not needed)
+        return idle, mends, _ORDER.index(terms[i].acts), -alone
 
     first = min(range(len(terms)), key=rank)
     alone = all(losses[i] < next_to_nothing * losses[first] for i in range(len(terms)) if i != first)
