@@ -57,6 +57,7 @@ from gyrofuse.mismatch.mechanisms.spectra.bumps.wandering_tone import DriftingTo
 from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
 from gyrofuse.mismatch.mechanisms.spectra.cross_talk import CrossTalk
 from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
+from gyrofuse.mismatch.mechanisms.spectra.high_pass import HighPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.notch import NotchFilter
 from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
@@ -435,6 +436,13 @@ def _(setting: Setting) -> Drawn:
     corner = setting.sizes(0.9 * highest, highest) / max(setting.size, 1.0)
     strength = torch.where(corner > 0, filter_strength(kind, corner.clamp(min=1) / RATE), 0.0)
     return Drawn(LowPassFilter(kind, strength), setting.of_each("corner", corner))
+
+
+@draws(HighPassFilter)
+def _(setting: Setting) -> Drawn:
+    kind = ("bilinear", "bilinear2")[int(setting.even(0, 2))]
+    corner = setting.sizes(0.03, 0.035) * min(setting.size, 4.0)
+    return Drawn(HighPassFilter(corner, 40.0, kind), setting.of_each("corner", RATE * corner))
 
 
 @draws(NotchFilter)

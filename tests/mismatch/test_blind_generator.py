@@ -18,7 +18,7 @@ from blind import (
     cases,
     common_noise,
     converter,
-    forms,
+    filters,
     kinds,
     likelihood,
     mechanics,
@@ -94,17 +94,19 @@ def test_a_wide_case_is_complete_at_every_size_that_exists(kind):
     assert made
 
 
-@pytest.mark.parametrize("design", forms.DESIGNS)
-def test_a_filter_of_any_design_leaves_the_power_that_is_said(design):
+@pytest.mark.parametrize(
+    ("design", "made"), [*filters.DESIGNS.items(), *((f"high pass {k}", v) for k, v in filters.HIGH_PASSES.items())]
+)
+def test_a_filter_of_any_design_leaves_the_power_that_is_said(design, made):
     """Power of filtered white noise in 8 bands over that promised, within 5 standard errors; a corner of 0.1.
 
     Where it passes next to nothing the ends of the record are all that is seen.
     """
-    made, n, corner = forms.DESIGNS[design], 2**15, 0.1
+    n, corner = 2**15, 0.1
     noise = made.apply(corner, np.random.default_rng(0).standard_normal((4, n)))
     power = likelihood.coefficients(noise) ** 2
     told = made.power(corner, likelihood.grid(n))
-    assert told[0] == pytest.approx(1, abs=0.11)  # a ripple of half a decibel
+    assert told[-1 if design.startswith("high") else 0] == pytest.approx(1, abs=0.11)  # a ripple of half a decibel
     for seen, said in zip(np.array_split(power, 8, axis=1), np.array_split(told, 8), strict=True):
         if said.mean() < 1e-3:
             continue
@@ -256,6 +258,7 @@ def test_oracle_keeps_its_false_alarm_rate():
 # the simulation has no recording shows.
 UNSIZED = (
     *("quantization_bare", "dead_band", "clipping", "stuck_samples", "form:filter", "form:asymmetric_telegraph"),
+    *("high_pass", "form:high_pass", "form:band_stop"),
     *("form:simulated_resonance", "form:simulated_source", "form:simulated_spikes"),
 )
 SIZES = [k for k in EFFECTS if kinds.KINDS[k].group in ("mechanism", "outside", "form") and k not in UNSIZED]

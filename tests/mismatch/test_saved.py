@@ -61,6 +61,7 @@ from gyrofuse.mismatch.mechanisms.spectra.bumps.wandering_tone import DriftingTo
 from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
 from gyrofuse.mismatch.mechanisms.spectra.cross_talk import CrossTalk
 from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
+from gyrofuse.mismatch.mechanisms.spectra.high_pass import HighPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.notch import NotchFilter
 from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
@@ -188,7 +189,9 @@ EVERY = (
     ParameterShift(BASE, torch.tensor([[0.1, 0.0], [1 / 3, 0.0], [0.0, 0.0], [0.2, 0.1]], dtype=torch.float64)),
     LowPassFilter("pole", numbers(0.7, 0.0)),
     LowPassFilter("bilinear2", numbers(0.7, 0.0), undone=True),
+    HighPassFilter(numbers(0.03, 0.0), 40.0, "bilinear2"),
     NotchFilter(0.11, 1 / 3, numbers(0.7, 0.0)),
+    NotchFilter(0.21, 0.6, numbers(0.0, 5.0), "bilinear4"),
     Resonance(MODE),
     SensorOrder((1, 0)),
     DriftingTone(MODE, True, 0.9),

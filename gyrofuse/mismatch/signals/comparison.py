@@ -74,7 +74,7 @@ class Comparison:
             one, or by which its own scatter: what is left where it acts is a matter of it.
         modes: Centre and half width of narrow noise that was built in, cycles per sample: it is no line, however like
             one it looks.
-        filters: Names of filters that were built in, and whether each sensor has them, `(sensor,)`.
+        filters: Names of filters that were built in, and factors `(sensor, frequency)` by which they changed powers.
         seed: Seed of the random numbers that tests draw: that of the caller's generator.
     """
 
@@ -86,7 +86,7 @@ class Comparison:
     converter: tuple[tuple[int, Callable[[Tensor], Tensor]], ...] = ()
     bent: tuple[Callable[[Tensor], Tensor], ...] = ()
     modes: tuple[tuple[float, float], ...] = ()
-    filters: tuple[tuple[str, Tensor], ...] = ()
+    filters: tuple[tuple[str, Callable[[Tensor], Tensor]], ...] = ()
     seed: int = 0
 
     @classmethod

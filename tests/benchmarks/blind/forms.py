@@ -1,4 +1,4 @@
-"""The catalogue's physics in other forms than any equation has it: filters of every design, harmonics, bursts, lags.
+"""The catalogue's physics in other forms than any equation has it: harmonics, bursts, lags.
 
 What such an effect is called is settled by its physics; that its form differs, by whoever looks closely.
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,115 +16,11 @@ from scipy import signal as sps
 from . import marginal, mechanics, shapes, thermal
 from .analog import OVERSAMPLING, relaxator
 from .bench import Bench, Part, quantity, rms
-from .likelihood import ar1_spectrum, comparison, divergence, folded, grid, quadratic_null, solve, spectral_llr, within
+from .likelihood import ar1_spectrum, divergence, folded, grid, spectral_llr, within
 from .spectral import added, resonance
 from .strange import noise_of_level
 
 Array = NDArray[np.float64]
-_MEMORY = 4096  # samples: of the slowest filter, whose corner is 0.003 of the rate, after which nothing is left
-FLOOR = 1e-9  # of a filter's squared gain: what it stops leaks in from elsewhere, and cannot be told from nothing
-
-
-Taps = tuple[Array, Array]
-
-
-def _average(corner: float) -> Taps:
-    """Mean of the last samples, whose number need not be whole; its half-power corner is about 0.443 over it."""
-    length = 0.443 / corner
-    taps = np.append(np.ones(int(length)), length - int(length))
-    return taps / taps.sum(), np.ones(1)
-
-
-def _pole(corner: float) -> Taps:
-    """Exponential smoothing."""
-    keep = math.exp(-2 * math.pi * corner)
-    return np.array([1 - keep]), np.array([1.0, -keep])
-
-
-class Design(NamedTuple):
-    """A low-pass filter by its corner in cycles per sample.
-
-    Attributes:
-        taps: Numerator and denominator by the corner, or `sections` of second order.
-        lowest, highest: Corners that it can have.
-    """
-
-    lowest: float
-    highest: float
-    taps: Callable[[float], Taps] | None = None
-    sections: Callable[[float], Array] | None = None
-
-    def power(self, corner: float, f: Array) -> Array:
-        """Squared gain at `f` cycles per sample."""
-        at = 2 * np.pi * f
-        if self.sections:
-            return np.abs(sps.sosfreqz(self.sections(corner), worN=at)[1]) ** 2
-        assert self.taps
-        return np.abs(sps.freqz(*self.taps(corner), worN=at)[1]) ** 2
-
-    def apply(self, corner: float, signal: Array) -> Array:
-        """A filter that has run for long when the record begins: over its mirrored beginning first."""
-        before = min(_MEMORY, signal.shape[-1] - 1)
-        whole = np.concatenate([signal[..., before:0:-1], signal], axis=-1)
-        start = whole[..., :1]
-        if self.sections:
-            filtered = sps.sosfilt(self.sections(corner), whole - start, axis=-1)
-        else:
-            assert self.taps
-            filtered = sps.lfilter(*self.taps(corner), whole - start, axis=-1)
-        return (filtered + start)[..., before:]
-
-
-def _by_sections(design: Callable[..., Array], *given: float, **options: str) -> Design:
-    return Design(0.003, 0.495, sections=lambda corner: design(*given, 2 * corner, output="sos", **options))
-
-
-DESIGNS: dict[str, Design] = {
-    **{f"butterworth {n}": _by_sections(sps.butter, n) for n in (1, 3, 4, 6)},
-    **{f"bessel {n}": _by_sections(sps.bessel, n, norm="mag") for n in (2, 3, 4)},
-    "chebyshev 4": _by_sections(sps.cheby1, 4, 0.5),
-    "elliptic 4": _by_sections(sps.ellip, 4, 0.5, 50),
-    "average": Design(0.01, 0.44, taps=_average),
-    "one pole": Design(0.003, 0.6, taps=_pole),
-    **{
-        f"windowed {n}": Design(1 / n, 0.48, taps=lambda c, n=n: (sps.firwin(n, 2 * c), np.ones(1)))  # type: ignore[misc]
-        for n in (15, 21, 31)
-    },
-}
-
-
-def low_pass(bench: Bench, nats: float, *, design: str | None = None) -> Part:
-    """A digital filter at the output rate, of any design, in the sensor's own processor: on all that it puts out."""
-    sensors = bench.some_sensors()
-    name = str(bench.rng.choice(list(DESIGNS))) if design is None else design
-    made = DESIGNS[name]
-    chosen = np.isin(np.arange(bench.n_sensors), sensors)[:, None]
-    f = grid(bench.n)
-
-    def spectrum(corner: float) -> Array:
-        power = np.maximum(made.power(corner, f), FLOOR)
-        return np.where(chosen, bench.spectrum * power, bench.spectrum)
-
-    def worth(inverse: float) -> Array:
-        return comparison(spectrum(1 / inverse), bench.spectrum, bench.share)
-
-    inverse = solve(nats, lambda x: float(worth(x).sum()), 1 / made.highest, 1 / made.lowest)
-    after, power = spectrum(1 / inverse), made.power(1 / inverse, f)
-    half = f[np.argmax(power < 0.5)] if bool((power < 0.5).any()) else 0.5
-    return Part(
-        "low_pass",
-        nats,
-        sensors,
-        lambda recording: spectral_llr(recording, after, bench.spectrum),
-        oracle_nats=float(divergence(after, bench.spectrum).sum()),
-        oracle_null=quadratic_null(after / bench.spectrum),
-        sensor_nats=tuple(float(v) for v in worth(inverse)[list(sensors)]),
-        converter=lambda x: np.where(chosen, made.apply(1 / inverse, x), x),
-        look_alikes=("parameter_shift",) if bench.looks_like_parameters(after) else (),
-        frequency_hz=float(half * bench.rate),
-        parameters={"corner": quantity(float(half * bench.rate), "Hz")},
-        form=name,
-    )
 
 
 def harmonics(bench: Bench, nats: float) -> Part:

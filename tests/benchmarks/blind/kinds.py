@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from . import common_noise, forms, marginal, shapes, spectral, strange
+from . import common_noise, filters, forms, marginal, shapes, spectral, strange
 from .bench import Bench, Part
 
 GROUPS = ("mechanism", "null", "pair", "two", "outside", "unidentifiable")  # and "real", which needs recordings
@@ -40,6 +40,7 @@ _MECHANISMS: dict[str, Callable[[Bench, float], Part]] = {
     "resonance": spectral.resonance,
     "quadratic_coupling": shapes.quadratic_coupling,
     "low_pass": spectral.low_pass,
+    "high_pass": _with(filters.high_pass, designs=filters.BUTTERWORTH),
     "notch": spectral.notch,
     "quantization": marginal.quantization,
     "quantization_bare": marginal.lattice,
@@ -133,8 +134,10 @@ _UNIDENTIFIABLE: dict[str, tuple[Callable[[Bench, float], Part], dict[str, Any]]
 }
 
 _FORMS: dict[str, Callable[[Bench, float], Part]] = {
-    "filter": forms.low_pass,
-    "average": _with(forms.low_pass, design="average"),
+    "filter": filters.low_pass,
+    "average": _with(filters.low_pass, design="average"),
+    "high_pass": filters.high_pass,
+    "band_stop": filters.band_stop,
     "harmonics": forms.harmonics,
     "rotor": forms.rotor,
     "bursts_of_a_tone": forms.bursts_of_a_tone,

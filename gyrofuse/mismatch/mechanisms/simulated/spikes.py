@@ -41,8 +41,21 @@ class SimulatedSpikes(Mechanism):
         found = Spikes.detect_and_fit(exchanged(comparison), 1.0)
         if found is None or not isinstance(found.effect, Spikes) or not found.identified:
             return None
+        effect = cls(found.effect)
+        if not effect.leaves_spectra_alike(comparison, found.sensors):
+            return None
         sentence = f"only the simulation has {found.sentence}"
-        return replace(found, effect=cls(found.effect), sentence=sentence, p_value=p_value, time_s=None)
+        return replace(found, effect=effect, sentence=sentence, p_value=p_value, time_s=None)
+
+    def leaves_spectra_alike(self, comparison: Comparison, sensors: tuple[int, ...]) -> bool:
+        """Whether the sensors' spectra are those of the recording, or most of how they differ is these outliers'.
+
+        Noise with heavy tails that has passed a filter is nearer to a normal one: it lacks no outliers.
+        """
+        most = 0.5
+        repaired = self.repair(comparison, comparison.generator())
+        (before, expected), (after, _) = (_spectral_distance(c, sensors) for c in (comparison, repaired))
+        return before < 2 * expected or after - expected < most * (before - expected)
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
         records = signal.reshape(-1, *signal.shape[-2:])
@@ -58,3 +71,12 @@ class SimulatedSpikes(Mechanism):
 
     def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
         self.added.plot(comparison, ax, sensor=sensor, fitted=fitted)
+
+
+def _spectral_distance(comparison: Comparison, sensors: tuple[int, ...]) -> tuple[float, float]:
+    """Squared distance of logarithms of powers over their variance, summed over sensors and bands, and its mean."""
+    observed, reference = comparison.observed, comparison.reference
+    d, s = observed.power_dof[list(sensors)], reference.power_dof[list(sensors)]
+    known = (d > 2) & (s > 2)
+    apart = (observed.log_power - reference.log_power)[list(sensors)].square() / (1 / d + 1 / s)
+    return float(apart[known].sum()), float(known.sum())

@@ -10,7 +10,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.likelihoods.spectra.components import Term
+from gyrofuse.mismatch.likelihoods.spectra.components import NO_SHARED, Term
 from gyrofuse.mismatch.likelihoods.spectra.filter_forms import butterworth_poles
 from gyrofuse.mismatch.likelihoods.spectra.fit import pieces
 from gyrofuse.mismatch.likelihoods.spectra.noise_parts import Ground
@@ -26,12 +26,15 @@ from gyrofuse.mismatch.signals.dims import OfSensors
 
 _ORDERS = {"bilinear": 1, **{f"bilinear{m}": m for m in (2, 4, 8, 16)}}  # as the forms of low passes are called
 _HIGHEST = 0.45  # corner, cycles per sample
-_DEEPEST = 12.0  # nepers: what leaks is more than what it lets through
+_DEEPEST = 40.0  # nepers: nothing is let through
 
 
 @dataclass(frozen=True, eq=False)
 class HighPass(Term):
-    """A high pass of each sensor: local is `log tan(pi f_c)`, shared what is kept from what it lets through, nepers."""
+    """A high pass of each sensor: local is `log tan(pi f_c)`.
+
+    Shared is what it keeps from passing far below, in nepers; without that number it is all.
+    """
 
     name: ClassVar[str] = "high_pass"
     acts: ClassVar[str] = "filter"
@@ -42,14 +45,14 @@ class HighPass(Term):
     kind: str = "bilinear"
 
     @classmethod
-    def starts(cls, ground: Ground, kind: str, depth: float = _DEEPEST) -> HighPass:
+    def starts(cls, ground: Ground, kind: str, shared: Tensor = NO_SHARED) -> HighPass:
         """Corners to start from: all in one, `local` is `(start, 1, 1)`."""
         numbers = torch.linspace(_number(float(ground.bands.frequency[0])), cls.upper, 37, dtype=torch.float64)
         every = torch.ones(1, len(ground.mean), dtype=torch.bool)
-        return cls(numbers[:, None, None], every, torch.full((1,), depth, dtype=torch.float64), kind)
+        return cls(numbers[:, None, None], every, shared, kind)
 
     def grid(self, ground: Ground) -> HighPass:
-        return replace(type(self).starts(ground, self.kind), shared=self.shared)
+        return type(self).starts(ground, self.kind, self.shared)
 
     def step_limit(self) -> tuple[Tensor, Tensor]:
         return torch.full_like(self.local, 0.7), torch.ones_like(self.shared)
@@ -61,11 +64,17 @@ class HighPass(Term):
     def values(self, ground: Ground, local: Tensor, shared: Tensor) -> Tensor:
         below = local[..., 0, :, None] - torch.tan(math.pi * ground.nodes).log()
         passed = torch.sigmoid(-2 * _ORDERS[self.kind] * below)
-        least = (-2 * shared[..., :1, None]).exp()
-        return torch.where(self.free[0, :, None], passed + (1 - passed) * least, 1.0)
+        if shared.shape[-1]:
+            passed = passed + (1 - passed) * (-2 * shared[..., :1, None]).exp()
+        return torch.where(self.free[0, :, None], passed, 1.0)
+
+    @property
+    def depth(self) -> float:
+        """What it keeps from passing, nepers."""
+        return float(self.shared[0]) if len(self.shared) else _DEEPEST
 
     def turn(self, f: Tensor) -> Tensor:
-        response = high_pass_response(f, self.local[0], float(self.shared[0]), self.kind)
+        response = high_pass_response(f, self.local[0], self.depth, self.kind)
         return torch.where(self.free[0, :, None], response.sgn(), 1.0)
 
     def form_cost(self, n_sensors: int) -> float:
@@ -101,13 +110,15 @@ class HighPassFilter(Filter):
     def starts(cls, data: Ratios, company: Sequence[Term]) -> Iterable[Term]:
         if any(isinstance(term, HighPass) for term in company):
             return ()
-        return _starts(data, company)[:1]
+        both = _starts(data, company)
+        return [next(start for start in both if bool(len(start.shared)) == seen) for seen in (False, True)]
 
     @classmethod
     def forms(cls, data: Ratios, term: Term, company: Sequence[Term]) -> Iterable[Term]:
         if not isinstance(term, HighPass):
             return ()
-        return [form for form in _starts(data, company) if form.kind != term.kind]
+        alike = [form for form in _starts(data, company) if len(form.shared) == len(term.shared)]
+        return [form for form in alike if form.kind != term.kind]
 
     @classmethod
     def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
@@ -155,20 +166,30 @@ class HighPassFilter(Filter):
     def of(cls, term: HighPass) -> HighPassFilter:
         """What a term stands for."""
         corner = torch.where(term.free[0], term.local[0].exp().atan() / math.pi, 0.0)
-        return cls(corner, float(term.shared[0]), term.kind)
+        return cls(corner, term.depth, term.kind)
+
+    @property
+    def seen(self) -> bool:
+        """Whether spectra tell what it lets through."""
+        return math.exp(-2 * self.depth) > FLOOR
 
     def let_through(self, comparison: Comparison) -> HighPassFilter:
-        """With what is left far below the corners, where that is too little for a fit of spectra."""
-        if math.exp(-2 * self.depth) > FLOOR:
-            return self
-        nothing = replace(self, depth=_DEEPEST)
-        far, most, has, f = 4, 4.0, self.corner > 0, comparison.bands.frequency
-        seen = (comparison.reference.dof > 0) & (comparison.observed.dof > 0) & (f < self.corner[has].min() / far)
-        if not bool(seen.any()):
-            return nothing
-        left = (comparison.observed.power / comparison.reference.power)[has][:, seen].median()
-        passed = nothing.response(f[seen])[has].abs().square().median()
-        return replace(self, depth=-float(left.log()) / 2) if bool(left > most * passed) else nothing
+        """With the depth that powers far below the corners, slower than any block, are likeliest with."""
+        far, f = 4, comparison.bands.frequency
+        d, s, has = comparison.observed.dof, comparison.reference.dof, self.corner > 0
+        slow = (d > 0) & (s > 0) & (f < self.corner[has].min() / far)
+        d, s = d[slow], s[slow]
+        ratio = (comparison.observed.power / comparison.reference.power)[has][:, slow]
+
+        def log_likelihood(effect: HighPassFilter) -> float:
+            """That of a ratio of powers (Fisher's F), up to a constant."""
+            x = ratio / effect.response(f[slow])[has].abs().square()
+            return float((d * x.log() - (d + s) * (d * x + s).log()).sum())
+
+        depths = [_DEEPEST, self.depth]
+        if ratio.numel():
+            depths.append(-float(ratio.median().log()) / 2)
+        return max((replace(self, depth=depth) for depth in depths), key=log_likelihood)
 
     def response(self, f: Tensor) -> Tensor:
         has = self.corner > 0
@@ -178,12 +199,11 @@ class HighPassFilter(Filter):
     def fit_without(self, comparison: Comparison, fold: int) -> Mechanism:
         has = self.corner > 0
         number = torch.where(has, self.corner.clamp(min=1e-9).mul(math.pi).tan().log(), 0.0)
-        shared = torch.tensor([self.depth], dtype=torch.float64)
+        shared = torch.tensor([self.depth], dtype=torch.float64) if self.seen else NO_SHARED
         found = refit(comparison, fold, HighPass(number[None], has[None], shared, self.kind), self.company)
         assert isinstance(found, HighPass)
         again = self.of(found)
-        seen = math.exp(-2 * self.depth) > FLOOR
-        return replace(self, corner=again.corner, depth=again.depth if seen else self.depth)
+        return replace(self, corner=again.corner, depth=again.depth if self.seen else self.depth)
 
 
 def high_pass_response(f: Tensor, number: Tensor, depth: float, kind: str) -> Tensor:
@@ -198,7 +218,8 @@ def high_pass_response(f: Tensor, number: Tensor, depth: float, kind: str) -> Te
 
 def _starts(data: Ratios, company: Sequence[Term]) -> list[HighPass]:
     """Every form at its likeliest corners, one that lets nothing through and one that does, the likeliest first."""
-    families = [HighPass.starts(data.ground, kind, depth) for kind in _ORDERS for depth in (_DEEPEST, 5.0)]
+    some = torch.full((1,), 3.0, dtype=torch.float64)
+    families = [HighPass.starts(data.ground, kind, shared) for kind in _ORDERS for shared in (NO_SHARED, some)]
     found = closest_starts(data, pieces(data, company), families)
     return [start for start in found if isinstance(start, HighPass)]
 

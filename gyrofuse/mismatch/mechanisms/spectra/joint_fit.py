@@ -152,7 +152,7 @@ def run_length(keep: Tensor) -> int:
 def leading_shape(comparison: Comparison) -> Shape | None:
     """Of the shapes that together explain the spectra the one that acts first; None where they do not.
 
-    Nor where one is flicker noise of another slope.
+    Nor where one is flicker noise of another slope, or the first mends the form of what was found before.
     """
     data = compared(comparison)
     fewest = 50.0  # complex ordinates, to search for the shape of a spectrum
@@ -169,8 +169,10 @@ def leading_shape(comparison: Comparison) -> Shape | None:
     wider = torch.ones(data.n_sensors, dtype=torch.float64) if fits else _overdispersion(data, chosen)
     seen = [_with_sd(comparison, chosen, i) for i in range(len(chosen.terms))]
     seen = [(term, (local * wider, shared * wider.max())) for term, (local, shared) in seen]
-    found = [_found_before(term, comparison) for term, _ in seen]
+    found = [_found_before(term, data, comparison) for term, _ in seen]
     first, gain, alone = _first(data, chosen, [term for term, _ in seen], found)
+    if found[first]:
+        return None
     term, others = chosen.terms[first], _others(chosen, first)
     n_classes = 16.0  # classes and frequencies that compete
     p = sidak(float(stats.chi2.sf(2 * gain, term.n_free(data.ground))), n_classes)
@@ -217,10 +219,18 @@ def _overdispersion(data: Ratios, chosen: Fit) -> Tensor:
     return (1 + 2 * fitness(data, chosen.model).excess.clamp(min=0) / dof).sqrt()
 
 
-def _found_before(term: Term, comparison: Comparison) -> bool:
-    """Whether all sensors that a filter acts on have one of its name already: it mends the form of that."""
-    has = term.free.any(0)
-    return any(name == term.name and not bool((has & ~acts).any()) for name, acts in comparison.filters)
+def _found_before(term: Term, data: Ratios, comparison: Comparison) -> bool:
+    """Whether a filter of its name acts already where this one acts most, in all of its sensors: it mends that form.
+
+    The recording's filter is another one than that of the simulation, which was undone.
+    """
+    plain, has = 0.1, term.free.any(0)  # log power
+    where = term.values(data.ground, term.local, term.shared).log().abs().argmax(-1)
+    for name, factor in comparison.filters:
+        done = factor(data.ground.nodes[where]).diagonal().log()[has]
+        if name == term.name and bool(((done < -plain) | ((done > plain) & (term.acts == "undo"))).all()):
+            return True
+    return False
 
 
 def _first(data: Ratios, chosen: Fit, terms: list[Term], found_before: list[bool]) -> tuple[int, float, bool]:

@@ -24,7 +24,11 @@ from gyrofuse.mismatch.mechanisms.spectra.spectral import Filter
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.dims import OfSensors
 
-_ORDERS = {"sampled": 1, "bilinear": 1, "bilinear2": 2, "bilinear4": 4}  # as the forms of low passes are called
+_ORDERS = {
+    "sampled": 1,
+    "bilinear": 1,
+    **{f"bilinear{m}": m for m in (2, 4, 8)},
+}  # as the forms of low passes are called
 
 
 @dataclass(frozen=True, eq=False)

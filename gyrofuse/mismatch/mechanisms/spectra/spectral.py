@@ -90,9 +90,8 @@ class Filter(Spectral):
 
     def apply_to_reference(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
         built = super().apply_to_reference(comparison, generator)
-        middle = torch.linspace(0.01, 0.49, 97, dtype=torch.float64)
-        acts = ((self.factor(reference_noise(comparison), middle) - 1).abs() > 1e-9).any(-1)
-        return replace(built, filters=(*built.filters, (self.name, acts)))
+        factor = partial(self.factor, reference_noise(comparison))
+        return replace(built, filters=(*built.filters, (self.name, factor)))
 
     def beneath_noise(self, later: Sequence[Mechanism], before: Comparison) -> Mechanism:
         """What acts on the simulation's own noise alone, as it is judged beside noise on top."""
