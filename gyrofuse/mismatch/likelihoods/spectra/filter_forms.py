@@ -245,6 +245,11 @@ def _poles(form: _Form) -> tuple[complex, ...]:
     return butterworth_poles(form.order)
 
 
+def order_of(kind: str) -> int:
+    """Order of a Butterworth filter by its form: "bilinear" and "sampled" are of the first."""
+    return int(kind.lstrip("abcdefghijklmnopqrstuvwxyz") or 1)
+
+
 @functools.lru_cache(maxsize=16)
 def butterworth_poles(order: int) -> tuple[complex, ...]:
     """Of Butterworth's analogue prototype, which halves the power at one."""

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.likelihoods.spectra.components import NO_SHARED, Term
-from gyrofuse.mismatch.likelihoods.spectra.filter_forms import butterworth_poles
+from gyrofuse.mismatch.likelihoods.spectra.filter_forms import butterworth_poles, order_of
 from gyrofuse.mismatch.likelihoods.spectra.fit import pieces
 from gyrofuse.mismatch.likelihoods.spectra.noise_parts import Ground
 from gyrofuse.mismatch.likelihoods.spectra.ratios import FLOOR, Ratios
@@ -24,9 +24,7 @@ from gyrofuse.mismatch.mechanisms.spectra.spectral import Filter
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.dims import OfSensors
 
-_ORDERS = {"bilinear": 1, **{f"bilinear{m}": m for m in (2, 4, 8, 16)}}  # as the forms of low passes are called
-_HIGHEST = 0.45  # corner, cycles per sample
-_DEEPEST = 40.0  # nepers: nothing is let through
+_FORMS = ("bilinear", "bilinear2", "bilinear4", "bilinear8", "bilinear16")  # as those of low passes are called
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +38,8 @@ class HighPass(Term):
     acts: ClassVar[str] = "filter"
     turns: ClassVar[bool] = True
     lower: ClassVar[float] = -12.0  # corner at the rate over 10^6
-    upper: ClassVar[float] = math.log(math.tan(math.pi * _HIGHEST))
+    upper: ClassVar[float] = math.log(math.tan(math.pi * 0.45))
+    deepest: ClassVar[float] = 40.0  # nepers: nothing is let through
 
     kind: str = "bilinear"
 
@@ -59,11 +58,11 @@ class HighPass(Term):
 
     def within(self) -> HighPass:
         local = self.local.clamp(min=self.lower, max=self.upper)
-        return replace(self, local=local, shared=self.shared.clamp(min=0.0, max=_DEEPEST))
+        return replace(self, local=local, shared=self.shared.clamp(min=0.0, max=self.deepest))
 
     def values(self, ground: Ground, local: Tensor, shared: Tensor) -> Tensor:
         below = local[..., 0, :, None] - torch.tan(math.pi * ground.nodes).log()
-        passed = torch.sigmoid(-2 * _ORDERS[self.kind] * below)
+        passed = torch.sigmoid(-2 * order_of(self.kind) * below)
         if shared.shape[-1]:
             passed = passed + (1 - passed) * (-2 * shared[..., :1, None]).exp()
         return torch.where(self.free[0, :, None], passed, 1.0)
@@ -71,14 +70,14 @@ class HighPass(Term):
     @property
     def depth(self) -> float:
         """What it keeps from passing, nepers."""
-        return float(self.shared[0]) if len(self.shared) else _DEEPEST
+        return float(self.shared[0]) if len(self.shared) else self.deepest
 
     def turn(self, f: Tensor) -> Tensor:
         response = high_pass_response(f, self.local[0], self.depth, self.kind)
         return torch.where(self.free[0, :, None], response.sgn(), 1.0)
 
     def form_cost(self, n_sensors: int) -> float:
-        return super().form_cost(n_sensors) + math.log(len(_ORDERS))
+        return super().form_cost(n_sensors) + math.log(len(_FORMS))
 
     def everywhere(self, ground: Ground) -> Term:
         faint = _number(float(ground.bands.frequency[0]) / 2)
@@ -186,7 +185,7 @@ class HighPassFilter(Filter):
             x = ratio / effect.response(f[slow])[has].abs().square()
             return float((d * x.log() - (d + s) * (d * x + s).log()).sum())
 
-        depths = [_DEEPEST, self.depth]
+        depths = [HighPass.deepest, self.depth]
         if ratio.numel():
             depths.append(-float(ratio.median().log()) / 2)
         return max((replace(self, depth=depth) for depth in depths), key=log_likelihood)
@@ -209,9 +208,9 @@ class HighPassFilter(Filter):
 def high_pass_response(f: Tensor, number: Tensor, depth: float, kind: str) -> Tensor:
     """Complex response `(sensor, frequency)` at `f` cycles per sample, of numbers `log tan(pi f_c)` `(sensor,)`."""
     u = torch.tan(math.pi * f) / number.exp()[:, None]
-    s, least = torch.complex(torch.zeros_like(u), u), math.exp(-depth / _ORDERS[kind])
+    s, least = torch.complex(torch.zeros_like(u), u), math.exp(-depth / order_of(kind))
     response = torch.ones_like(s)
-    for pole in butterworth_poles(_ORDERS[kind]):
+    for pole in butterworth_poles(order_of(kind)):
         response = response * (s - least * pole) / (s - pole)
     return response
 
@@ -219,7 +218,7 @@ def high_pass_response(f: Tensor, number: Tensor, depth: float, kind: str) -> Te
 def _starts(data: Ratios, company: Sequence[Term]) -> list[HighPass]:
     """Every form at its likeliest corners, one that lets nothing through and one that does, the likeliest first."""
     some = torch.full((1,), 3.0, dtype=torch.float64)
-    families = [HighPass.starts(data.ground, kind, shared) for kind in _ORDERS for shared in (NO_SHARED, some)]
+    families = [HighPass.starts(data.ground, kind, shared) for kind in _FORMS for shared in (NO_SHARED, some)]
     found = closest_starts(data, pieces(data, company), families)
     return [start for start in found if isinstance(start, HighPass)]
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.likelihoods.spectra.components import Term
-from gyrofuse.mismatch.likelihoods.spectra.filter_forms import butterworth_poles
+from gyrofuse.mismatch.likelihoods.spectra.filter_forms import butterworth_poles, order_of
 from gyrofuse.mismatch.likelihoods.spectra.fit import pieces
 from gyrofuse.mismatch.likelihoods.spectra.noise_parts import Ground
 from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios
@@ -24,11 +24,7 @@ from gyrofuse.mismatch.mechanisms.spectra.spectral import Filter
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.dims import OfSensors
 
-_ORDERS = {
-    "sampled": 1,
-    "bilinear": 1,
-    **{f"bilinear{m}": m for m in (2, 4, 8)},
-}  # as the forms of low passes are called
+_FORMS = ("sampled", "bilinear", "bilinear2", "bilinear4", "bilinear8")  # as those of low passes are called
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +43,7 @@ class Notch(Term):
 
     def values(self, ground: Ground, local: Tensor, shared: Tensor) -> Tensor:
         centre, width = (shared[..., k, None, None].exp() for k in (0, 1))
-        u, order = _over_centre(ground.nodes, centre, self.kind), _ORDERS[self.kind]
+        u, order = _over_centre(ground.nodes, centre, self.kind), order_of(self.kind)
         through, taken = (1 - u.square()).square().pow(order), (width * u).square().pow(order)
         return (through + (-2 * local[..., 0, :, None]).exp() * taken) / (through + taken)
 
@@ -62,7 +58,7 @@ class Notch(Term):
         return replace(self, free=torch.ones_like(self.free), local=torch.where(self.free, self.local, faint))
 
     def form_cost(self, n_sensors: int) -> float:
-        return super().form_cost(n_sensors) + (0.0 if self.kind == "sampled" else math.log(len(_ORDERS)))
+        return super().form_cost(n_sensors) + (0.0 if self.kind == "sampled" else math.log(len(_FORMS)))
 
     def within(self) -> Notch:
         """Both sides of it are below half the rate: else it is a low pass."""
@@ -182,7 +178,7 @@ class NotchFilter(Filter):
 
 def notch_response(f: Tensor, centre: float, width: float, depth: Tensor, kind: str) -> Tensor:
     """Complex response `(sensor, frequency)` at `f` cycles per sample of notches of depth `(sensor,)`."""
-    u, order = _over_centre(f, torch.tensor(centre, dtype=torch.float64), kind), _ORDERS[kind]
+    u, order = _over_centre(f, torch.tensor(centre, dtype=torch.float64), kind), order_of(kind)
     through, taken = 1 - u.square(), torch.complex(torch.zeros_like(u), max(width, 1e-9) * u)
     left = (-depth / order).exp()[:, None] * taken
     response = torch.ones(left.shape, dtype=left.dtype)
@@ -221,4 +217,4 @@ def _start(data: Ratios, company: Sequence[Term], kind: str = "sampled") -> Notc
 
 def _starts(data: Ratios, company: Sequence[Term]) -> list[Notch]:
     """That of every form."""
-    return [_start(data, company, kind) for kind in _ORDERS]
+    return [_start(data, company, kind) for kind in _FORMS]
