@@ -68,12 +68,12 @@ def common_ratio(comparison: Comparison) -> CommonRatio | None:
     )
     gone = before.of(~stays)
     best: CommonRatio | None = None
-    least, most, like = 0.8, 1.25, 2.0  # ratios of rates, and of amplitudes
+    least, most, like = 0.2, 5.0, 2.0  # ratios of rates, and of amplitudes
     ratios = after.frequency / gone.frequency[:, None]  # (line before, line after)
     sizes = after.amplitude.norm(dim=0) / gone.amplitude.norm(dim=0)[:, None]
     unlike = sizes.log().abs().maximum((1 / (2 * after.nats) + 1 / (2 * gone.nats[:, None])).sqrt())
     possible = (ratios > least) & (ratios < most) & (sizes > 1 / like) & (sizes < like)
-    density = len(new) / (most - least)
+    density = len(new) / math.log(most / least)  # of relative frequencies
     for i, j in possible.nonzero().tolist():
         ratio = float(ratios[i, j])
         # By how much the others are off, in units of their own frequency.
