@@ -66,9 +66,15 @@ def sensor_delays(comparison: Comparison) -> Delays | None:
     return found if are_delays(phases, found) and not changes_power(phases, found.delay) else None
 
 
-def phases_of(comparison: Comparison, blocks: Tensor) -> _Phases | None:
-    """Those of some of the recording's blocks `(block,)`; None where the simulation's sensors share nothing."""
-    shared, floor = 0.5, 1e-3  # coherence that shows a delay; share of its own that a sensor has at least
+def phases_of(comparison: Comparison, blocks: Tensor, shared: float = 0.5) -> _Phases | None:
+    """Those of some of the recording's blocks `(block,)`; None where the simulation's sensors share nothing.
+
+    Args:
+        comparison: Recording and simulation.
+        blocks: Which blocks.
+        shared: Coherence of bands that show a delay.
+    """
+    floor = 1e-3  # share of its own that a sensor has at least
     both, p = block_spectra(comparison), comparison.n_sensors
     first = len(both.bands.below)
     inner = slice(first, len(both.bands.dof) - len(both.bands.beyond))

@@ -22,6 +22,7 @@ from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED
 from gyrofuse.mismatch.stats.multiplicity import sidak
 
 _SURE = 5.0  # standard deviations of a logarithm
+_COHERENT = 0.15  # coherence that shows a sign
 _SHARED = 100.0  # ordinates that show what is shared
 
 
@@ -86,7 +87,7 @@ def log_sizes(comparison: Comparison, blocks: Tensor) -> Tensor:
 
 def sign_gain(comparison: Comparison, blocks: Tensor, sign: Tensor) -> float:
     """Log likelihood of signs `(sensor,)` over none, from what sensors share in some blocks `(block,)`, nats."""
-    phases = phases_of(comparison, blocks)
+    phases = phases_of(comparison, blocks, _COHERENT)
     return 0.0 if phases is None else _gain(phases.weights.real.sum(0), sign)
 
 
@@ -160,7 +161,8 @@ def _signs(comparison: Comparison) -> tuple[Tensor, float]:
     """Signs of sensors, most of which are 1, and their p value."""
     sign = torch.ones(comparison.n_sensors, dtype=torch.float64)
     lines = line_signs(comparison)
-    phases = phases_of(comparison, torch.ones(N_JUDGED, dtype=torch.bool)) if comparison.n_sensors > 1 else None
+    every = torch.ones(N_JUDGED, dtype=torch.bool)
+    phases = phases_of(comparison, every, _COHERENT) if comparison.n_sensors > 1 else None
     if phases is None:
         return (sign, 1.0) if lines is None else (lines.sign, lines.p_value)
     pairs = phases.weights.real.sum(0)

@@ -225,6 +225,8 @@ def _found_before(term: Term, data: Ratios, comparison: Comparison) -> bool:
     The recording's filter is another one than that of the simulation, which was undone.
     """
     plain, has = 0.1, term.free.any(0)  # log power
+    if term.acts not in ("filter", "undo"):
+        return False
     where = term.values(data.ground, term.local, term.shared).log().abs().argmax(-1)
     for name, factor in comparison.filters:
         done = factor(data.ground.nodes[where]).diagonal().log()[has]
