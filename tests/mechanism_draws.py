@@ -64,6 +64,7 @@ from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
 from gyrofuse.mismatch.mechanisms.values.angle_quantization import AngleQuantization
 from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
+from gyrofuse.mismatch.mechanisms.values.held_values import HeldValues
 from gyrofuse.mismatch.mechanisms.values.interleaving import Interleaving
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.values.sensor_gain import SensorGain
@@ -136,6 +137,14 @@ def _(setting: Setting) -> Drawn:
         StuckSamples(probability, torch.zeros_like(probability), together),
         setting.of_each("probability", probability),
     )
+
+
+@draws(HeldValues)
+def _(setting: Setting) -> Drawn:
+    period, phase = setting.sizes(2.0, 5.0, 1.0), setting.sizes(0.0, 1.0)
+    if setting.chance():
+        period, phase = period.round(), phase.round()
+    return Drawn(HeldValues(period, phase, torch.zeros_like(period)), setting.of_each("rate", RATE / period))
 
 
 # The law of single samples, and what changes with time.

@@ -33,7 +33,7 @@ class Delays(NamedTuple):
     gain: float
 
 
-class _Phases(NamedTuple):
+class Phases(NamedTuple):
     """Products of the recording with the inverse of the simulation, by band.
 
     Attributes:
@@ -66,7 +66,7 @@ def sensor_delays(comparison: Comparison) -> Delays | None:
     return found if are_delays(phases, found) and not changes_power(phases, found.delay) else None
 
 
-def phases_of(comparison: Comparison, blocks: Tensor, shared: float = 0.5) -> _Phases | None:
+def phases_of(comparison: Comparison, blocks: Tensor, shared: float = 0.5) -> Phases | None:
     """Those of some of the recording's blocks `(block,)`; None where the simulation's sensors share nothing.
 
     Args:
@@ -95,7 +95,7 @@ def phases_of(comparison: Comparison, blocks: Tensor, shared: float = 0.5) -> _P
     frequency = both.bands.mean_of(density * both.bands.nodes) / both.bands.mean_of(density)
     ratio = (s.diagonal(dim1=-2, dim2=-1).real / c.diagonal(dim1=-2, dim2=-1).real).clamp(min=1e-300).log()
     apart = 1 - (off.abs().square().sum((-1, -2)) / (p * (p - 1))).clamp(max=1)  # squares of coherences are shared
-    return _Phases(
+    return Phases(
         frequency[inner][known],
         -count[known, None, None] * inverse * s[known].mT,
         ratio[plain],
@@ -103,7 +103,7 @@ def phases_of(comparison: Comparison, blocks: Tensor, shared: float = 0.5) -> _P
     )
 
 
-def fitted_delays(phases: _Phases) -> Delays:
+def fitted_delays(phases: Phases) -> Delays:
     """One sensor after the other over a grid, then all by Newton's steps; most of them are taken for right."""
     p, farthest, rounds = phases.weights.shape[-1], 16.0, 6
     grid = torch.arange(-farthest, farthest + 0.125, 0.25, dtype=torch.float64)
@@ -126,7 +126,7 @@ def fitted_delays(phases: _Phases) -> Delays:
     return Delays(delay, sd, best - none)
 
 
-def are_delays(phases: _Phases, found: Delays) -> bool:
+def are_delays(phases: Phases, found: Delays) -> bool:
     """Whether phases turn alike in the lower and the upper half of the evidence: those of a resonance do not."""
     sure, share = 5.0, 0.1  # standard deviations, and of the delay, by which halves may differ
     evidence = (phases.frequency.square() * _off(phases).abs().sum((-1, -2))).cumsum(0)
@@ -141,7 +141,7 @@ def are_delays(phases: _Phases, found: Delays) -> bool:
     return bool(((below.delay - above.delay).abs() < most).all())
 
 
-def changes_power(phases: _Phases, delay: Tensor) -> bool:
+def changes_power(phases: Phases, delay: Tensor) -> bool:
     """Whether a sensor with a delay has a spectrum of another shape, beside the others, as behind a filter."""
     least, sure = 0.05, 5.0  # rms of the change of log power; standard deviations
     late = delay.abs() > 0.1
@@ -154,7 +154,7 @@ def changes_power(phases: _Phases, delay: Tensor) -> bool:
     return bool(((squares / weight.sum(0) > least**2) & (squares > n + sure * math.sqrt(2 * n))).any())
 
 
-def _off(phases: _Phases) -> Tensor:
+def _off(phases: Phases) -> Tensor:
     """Weights of pairs of different sensors."""
     return phases.weights * (1 - torch.eye(phases.weights.shape[-1], dtype=phases.weights.dtype))
 
@@ -165,7 +165,7 @@ def _usual(delay: Tensor) -> Tensor:
     return delay[int(apart.argmin())]
 
 
-def _derivatives(phases: _Phases, delay: Tensor) -> tuple[Tensor, Tensor]:
+def _derivatives(phases: Phases, delay: Tensor) -> tuple[Tensor, Tensor]:
     """Slope `(sensor,)` of the log likelihood, and the information `(sensor, sensor)`."""
     turn = torch.polar(torch.ones(()).to(delay), 2 * math.pi * delay * phases.frequency[:, None])
     turned = turn.conj()[:, :, None] * _off(phases) * turn[:, None, :]

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.detectors.lines.line_signs import line_signs
-from gyrofuse.mismatch.detectors.spectra.delays import phases_of
+from gyrofuse.mismatch.detectors.spectra.delays import Phases, phases_of
 from gyrofuse.mismatch.likelihoods.spectra.data import block_spectra, reference_noise, shared_ordinates
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
@@ -22,7 +22,6 @@ from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED
 from gyrofuse.mismatch.stats.multiplicity import sidak
 
 _SURE = 5.0  # standard deviations of a logarithm
-_COHERENT = 0.15  # coherence that shows a sign
 _SHARED = 100.0  # ordinates that show what is shared
 
 
@@ -87,8 +86,13 @@ def log_sizes(comparison: Comparison, blocks: Tensor) -> Tensor:
 
 def sign_gain(comparison: Comparison, blocks: Tensor, sign: Tensor) -> float:
     """Log likelihood of signs `(sensor,)` over none, from what sensors share in some blocks `(block,)`, nats."""
-    phases = phases_of(comparison, blocks, _COHERENT)
+    phases = _phases(comparison, blocks)
     return 0.0 if phases is None else _gain(phases.weights.real.sum(0), sign)
+
+
+def _phases(comparison: Comparison, blocks: Tensor) -> Phases | None:
+    shared = 0.15  # coherence that shows a sign
+    return phases_of(comparison, blocks, shared)
 
 
 def _gain(pairs: Tensor, sign: Tensor) -> float:
@@ -162,7 +166,7 @@ def _signs(comparison: Comparison) -> tuple[Tensor, float]:
     sign = torch.ones(comparison.n_sensors, dtype=torch.float64)
     lines = line_signs(comparison)
     every = torch.ones(N_JUDGED, dtype=torch.bool)
-    phases = phases_of(comparison, every, _COHERENT) if comparison.n_sensors > 1 else None
+    phases = _phases(comparison, every) if comparison.n_sensors > 1 else None
     if phases is None:
         return (sign, 1.0) if lines is None else (lines.sign, lines.p_value)
     pairs = phases.weights.real.sum(0)
