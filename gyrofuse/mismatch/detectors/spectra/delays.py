@@ -85,7 +85,8 @@ def phases_of(comparison: Comparison, blocks: Tensor, shared: float = 0.5) -> Ph
     c, s = simulated * scale, seen * scale
     off = c - torch.eye(p, dtype=c.dtype)
     plain = (ordinates > 4 * p) & (d > 0)
-    known = plain & (off.abs().amax((-1, -2)) > shared)
+    by_chance = ((2 * math.log(p) + 7) / ordinates.clamp(min=1.0)).sqrt()  # of any pair, in a band of a thousand
+    known = plain & (off.abs().amax((-1, -2)) > by_chance.clamp(min=shared))
     if not bool(known.any()):
         return None
     inverse = torch.linalg.inv(c[known] + floor * torch.eye(p, dtype=c.dtype))
