@@ -225,6 +225,12 @@ class Mechanism:
         """Whether it is seen in a comparison with all other findings repaired; by default it was, and is not asked."""
         return True
 
+    def found(
+        self, sentence: str, p_value: float, sensors: tuple[int, ...], parameters: dict[str, Parameter], **more: Any
+    ) -> Finding:
+        """A finding of it under its own name, with further entries by theirs."""
+        return Finding(self.name, self, sentence, p_value, sensors, parameters, **more)
+
     @property
     def follows(self) -> tuple[str, ...]:
         """Auxiliary channels that it follows; none by default."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -23,9 +23,6 @@ from gyrofuse.mismatch.signals.variance_course import (
 from gyrofuse.mismatch.stats.segments import course_scores
 from gyrofuse.mismatch.stats.variance_courses import Course, fitted_levels
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 MOSTLY = 0.5  # of the way of a course
 
 
@@ -43,7 +40,7 @@ class ChangingVariance(Mechanism):
         """The course of the variance in a record of `n_samples`."""
         raise NotImplementedError
 
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         course = self.course(comparison.n_samples, comparison.info).variance if fitted else None
         pictures.variance_over_time(ax, comparison, sensor, course)
 

@@ -108,9 +108,7 @@ class ChannelNoise(LevelCourse):
             value, reach = float(known.factor[i]), math.exp(Z * float(course.log_factor_sd[i]))
             parameters[f"factor[{i}]"] = Parameter(value, value / reach, value * reach, "")
         largest = max(sensors, key=lambda i: abs(math.log(float(known.factor[i]))))
-        return Finding(
-            cls.name,
-            effect,
+        return effect.found(
             f"the noise's variance in {info.named(sensors, 'all sensors')} follows {_WORDS[kind]}{readable(name)}"
             f"{f' (row {row + 1})' if len(_rows(info.channels[name])) > 1 else ''}: it changes by a factor of "
             f"{float(known.factor[largest]):.3g} (sensor {info.sensors[largest]}) from {float(ends[0]):.4g} to "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 import torch
@@ -23,9 +23,6 @@ from gyrofuse.mismatch.stats.inclusion import included_sensors
 from gyrofuse.mismatch.stats.limits import Z
 from gyrofuse.mismatch.stats.multiplicity import sidak
 from gyrofuse.mismatch.stats.segments import runs_of
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 _MOVES = 1.25  # highest over lowest frequency, from which a tone moves and does not wander
 
@@ -87,9 +84,7 @@ class Chirp(Transient):
             parameters[f"amplitude[{i}]"] = Parameter(a, max(a - own, 0.0), a + own, info.measure)
         loudest = max(there, key=lambda i: float(size[i]))
         does = "runs up" if stop > start * _MOVES else "runs down" if start > stop * _MOVES else "changes its speed"
-        return Finding(
-            cls.name,
-            effect,
+        return effect.found(
             f"a tone whose frequency moves from {start:.4g} Hz at {first:.4g} s to {stop:.4g} Hz at {last:.4g} s in "
             f"{info.named(there, 'all sensors')}, of amplitude {float(size[loudest]):.3g} {info.measure} (sensor "
             f"{info.sensors[loudest]}), that the simulation does not have: something that {does}",
@@ -255,7 +250,7 @@ class Chirp(Transient):
         there = self.cosine.any(0) | self.sine.any(0)
         return self._fitted(comparison, kept_of(comparison.n_samples, fold))._shrunk(comparison, there)
 
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         low, high = float(self.frequency_hz.min()), float(self.frequency_hz.max())
         track = (self.time_s, self.frequency_hz) if fitted else None
         window = 2 * float(self.time_s[1] - self.time_s[0])

@@ -107,9 +107,7 @@ class GradualChange(LevelCourse):
         for i in sensors:
             value, spread = float(factor[i]), math.exp(float(reach[i]))
             parameters[f"factor[{i}]"] = Parameter(value, value / spread, value * spread, "")
-        return Finding(
-            cls.name,
-            effect,
+        return effect.found(
             _sentence(comparison, way, factor, sensors),
             p_value,
             sensors,

@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import Annotated, ClassVar
 
 import torch
 from torch import Tensor
@@ -25,9 +25,6 @@ from gyrofuse.mismatch.signals.folds import N_FOLDS
 from gyrofuse.mismatch.signals.lines import whitened
 from gyrofuse.mismatch.stats.inclusion import included_sensors
 from gyrofuse.mismatch.stats.limits import Z
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,9 +77,7 @@ class Pulses(Transient):
         concerned = tuple((effect.size != 0).any(0).nonzero()[:, 0].tolist())
         largest, onset = int(strongest.amplitude.abs().argmax()), strongest.pulse.onset / rate
         many = "a pulse" if len(pulses) == 1 else f"{len(pulses)} pulses"
-        return Finding(
-            cls.name,
-            effect,
+        return effect.found(
             f"{many} of one sign and then gone{often_words(len(pulses), often)}, in "
             f"{info.named(concerned, 'all sensors')}: the strongest at {onset:.6g} s, {width:.3g} s long, of "
             f"{float(strongest.amplitude[largest]):.3g} {info.measure} in sensor {info.sensors[largest]}, as of "
@@ -115,7 +110,7 @@ class Pulses(Transient):
             left = own - _path(pulse, sizes[-1], comparison.n_samples)
         return replace(self, size=torch.stack(sizes))
 
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         rate = comparison.info.rate
         width = float(self.width_s[0]) * rate  # of the strongest
         first = round(float(self.onset_s[0]) * rate - 2 * width - 8)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import Annotated, ClassVar
 
 import torch
 from torch import Tensor
@@ -24,9 +24,6 @@ from gyrofuse.mismatch.signals.folds import N_FOLDS
 from gyrofuse.mismatch.signals.lines import whitened
 from gyrofuse.mismatch.stats.inclusion import included_sensors
 from gyrofuse.mismatch.stats.limits import Z
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,9 +103,7 @@ class RingDown(Transient):
             parameters[f"amplitude[{i}]"] = Parameter(a, max(a - reach, 0.0), a + reach, info.measure)
         concerned = tuple((effect.amplitude > 0).any(0).nonzero()[:, 0].tolist())
         largest, onset = int(amplitude.argmax()), strongest.tone.onset / info.rate
-        return Finding(
-            cls.name,
-            effect,
+        return effect.found(
             f"{knocks} {'knock' if knocks == 1 else 'knocks'} after which something rings"
             f"{often_words(knocks, often)}, in {info.named(concerned, 'all sensors')}: the strongest at {onset:.6g} s, "
             f"at {f:.4g} Hz, dies "
@@ -145,7 +140,7 @@ class RingDown(Transient):
             left = own - _path(fitted[-1], comparison.n_samples)
         return self.of(fitted, comparison)
 
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         rate = comparison.info.rate
         tau = float(self.decay_s[0]) * rate  # of the strongest
         first = round(float(self.onset_s[0]) * rate - 2 * tau - 8)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -21,9 +21,6 @@ from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples, held_out_blocks
 from gyrofuse.mismatch.signals.prediction_errors import left_out, scaled_innovations
 from gyrofuse.mismatch.stats.limits import Z
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 
 def _lasts(z: Tensor) -> bool:
@@ -89,9 +86,7 @@ class ScaleMixture(Mechanism):
             value = float(ratio[i])
             parameters[f"ratio[{i}]"] = Parameter(value, value / reach, value * reach, "")
         largest = max(hit, key=lambda i: gains[i])
-        return Finding(
-            cls.name,
-            cls(share, torch.where(ratio > 0, ratio, 1.0)),
+        return cls(share, torch.where(ratio > 0, ratio, 1.0)).found(
             f"the noise of {info.named(hit, 'all sensors')} has two levels, sample by sample: "
             f"{100 * laws[largest].share:.3g} % of the samples are {float(ratio[largest]):.3g} times as loud as others"
             f"{f' (sensor {info.sensors[largest]})' if len(hit) > 1 else ''}",
@@ -134,5 +129,5 @@ class ScaleMixture(Mechanism):
         built = super().apply_to_reference(comparison, generator)
         return replace(built, reference=replace(built.reference, gaussian=False))
 
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         pictures.tails(ax, comparison, sensor)

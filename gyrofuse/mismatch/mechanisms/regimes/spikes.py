@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -33,10 +33,6 @@ from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples, held_out_blocks
 from gyrofuse.mismatch.signals.prediction_errors import left_out, predicted
 from gyrofuse.mismatch.stats.segments import episodes_of, two_level_scores
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 
 _HOUR = 3600.0
 _ALIKE = 5.0  # nats
@@ -134,9 +130,7 @@ class Spikes(Mechanism):
         info = comparison.info
         where = info.named(hit, "all sensors")
         how = "at the same time, as shocks do" if effect.together else "not at the same time, as errors of a bus are"
-        return Finding(
-            cls.name,
-            effect,
+        return effect.found(
             f"isolated outliers in {where}{', ' + how if len(hit) > 1 else ''}: "
             f"{laws[largest].rate * info.rate * _HOUR:.3g} an hour of {float(effect.amplitude[largest]):.3g} "
             f"{info.measure}{f' in sensor {info.sensors[largest]}' if len(hit) > 1 else ''}",
@@ -228,7 +222,7 @@ class Spikes(Mechanism):
         draws = torch.rand(likely.shape, generator=generator, dtype=torch.float64)
         return predicted(comparison.observed, (draws < likely) & (self.rate > 0)[:, None], generator)
 
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         pictures.tails(ax, comparison, sensor)
 
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:

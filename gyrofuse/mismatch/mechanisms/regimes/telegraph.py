@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 from scipy import stats
@@ -23,10 +23,6 @@ from gyrofuse.mismatch.signals.folds import N_JUDGED, in_fold
 from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum
 from gyrofuse.mismatch.stats.limits import Z
 from gyrofuse.noise.processes import AR1
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 
 _PRESENT, _CERTAIN = 5.0, 8.0  # nats over the Gaussian rival, of all sensors together
 _GAUSSIAN = ("flicker", "parameter_shift")  # what may have the same spectrum
@@ -85,9 +81,7 @@ class RandomTelegraph(Mechanism):
                 parameters[f"{name}[{i}]"] = Parameter(value, value / reach, value * reach, unit)
         largest = max(sensors, key=lambda i: float(effect.half_step[i]))
         where = comparison.info.named(sensors, "all sensors")
-        return Finding(
-            cls.name,
-            effect,
+        return effect.found(
             f"the rate jumps between two levels in {where}: half a step of {float(effect.half_step[largest]):.3g} "
             f"{comparison.info.measure} to either side in sensor {comparison.info.sensors[largest]}, "
             f"staying {float(effect.up[largest]):.3g} s "
@@ -116,7 +110,7 @@ class RandomTelegraph(Mechanism):
         sensors = self.half_step.nonzero()[:, 0].tolist()
         return self._of(comparison, {i: fits[i].without(fold) for i in sensors if i in fits})
 
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         dwell = float(torch.minimum(self.up, self.down)[sensor]) * comparison.info.rate
         pictures.two_levels(ax, comparison, sensor, float(self.half_step[sensor]) if fitted else 0.0, dwell)
 

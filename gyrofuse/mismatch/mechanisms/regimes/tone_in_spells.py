@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import Annotated, ClassVar
 
 import torch
 from torch import Tensor
@@ -23,9 +23,6 @@ from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.stats.inclusion import included_sensors
 from gyrofuse.mismatch.stats.limits import Z
 from gyrofuse.mismatch.stats.segments import runs_of
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,9 +104,7 @@ class ToneInSpells(Transient):
             parameters[f"amplitude[{i}]"] = Parameter(a, max(a - Z * sd, 0.0), a + Z * sd, info.measure)
         loudest = max(there, key=lambda i: float(effect.amplitude[longest, i]))
         more = f" and {len(spells) - 1} more times, {float(lengths.sum()) / n:.1%} of the time," if spells[1:] else ""
-        return Finding(
-            cls.name,
-            effect,
+        return effect.found(
             f"a tone at {frequency:.6g} Hz that is on from {start:.5g} s to {stop:.5g} s{more} in "
             f"{info.named(there, 'all sensors')}, of amplitude up to {float(effect.amplitude[longest, loudest]):.3g} "
             f"{info.measure} (sensor {info.sensors[loudest]}), that the simulation does not have: something that "
@@ -170,7 +165,7 @@ class ToneInSpells(Transient):
         there = self.amplitude.any(0)
         return replace(found, cosine=found.cosine * there, sine=found.sine * there)
 
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         f = float(self.frequency_hz[int(self.amplitude[:, sensor].argmax())])
         path = self.path(comparison.n_samples, comparison.info.rate) if fitted else None
         pictures.tone_over_time(ax, comparison, sensor, f, path)

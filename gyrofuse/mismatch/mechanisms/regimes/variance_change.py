@@ -95,9 +95,7 @@ class VarianceChange(ChangingVariance):
         largest = max(sensors, key=lambda i: abs(math.log(parameters[f"factor[{i}]"].value)))
         where = comparison.info.named(sensors, "all sensors")
         more = f" and {len(found.episodes) - 1} more times" if len(found.episodes) > 1 else ""
-        return Finding(
-            cls.name,
-            effect,
+        return effect.found(
             f"the noise's variance is {parameters[f'factor[{largest}]'].value:.3g} times the rest (sensor "
             f"{comparison.info.sensors[largest]}) from {parameters['start'].value:.6g} s "
             f"to {parameters['stop'].value:.6g} s{more} in {where}",

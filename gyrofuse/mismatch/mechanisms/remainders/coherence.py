@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import Annotated, ClassVar
 
 import torch
 from torch import Tensor
@@ -19,9 +19,6 @@ from gyrofuse.mismatch.signals.filters import mixed
 from gyrofuse.mismatch.signals.folds import spectral_gains
 from gyrofuse.mismatch.signals.psd import between_bands, drawn_towards, narrow_bands
 from gyrofuse.mismatch.signals.records import Records
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +96,7 @@ class CoherenceRemainder(Spectral):
         size = matrices.diagonal(dim1=-2, dim2=-1).sqrt()
         return _at(coherence, self.frequency, f) * size[:, :, None] * size[:, None, :].conj()
 
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         pictures.coherence(ax, comparison, sensor, (self.after - self.before)[:, sensor].abs().mean(0))
 
     def fit_without(self, comparison: Comparison, fold: int) -> CoherenceRemainder:

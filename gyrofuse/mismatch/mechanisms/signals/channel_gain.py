@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import Annotated, ClassVar
 
 import torch
 from torch import Tensor
@@ -24,10 +24,6 @@ from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.signals.folds import estimation_samples, signal_gains
 from gyrofuse.mismatch.stats.inclusion import included_sensors
 from gyrofuse.mismatch.stats.limits import Z
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 
 _OF_ONE_BAND = 0.9  # share of the evidence from which a gain might be a line's alone
 _WHOLE = ("each", "length")  # kinds of rows that are made from all of a channel
@@ -135,9 +131,7 @@ class ChannelGain(KnownPath):
         effect = cls(name, _only(fit.gains, present), kind)
         if transfer is not None:
             effect = replace(effect, pole=transfer.pole, response=transfer.weights)
-        finding = Finding(
-            cls.name,
-            effect,
+        finding = effect.found(
             cls.words(abs(sizes[largest].value), name if kind in _WHOLE else f"{kind} of {name}", where, unit) + words,
             p_value,
             present,
@@ -176,7 +170,7 @@ class ChannelGain(KnownPath):
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
         return signal_gains(comparison, self._path(comparison.info, comparison.n_samples), fold)
 
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         path = self._path(comparison.info, comparison.n_samples)[sensor]
         pictures.gain_on_channel(ax, comparison, sensor, path, f"share that follows {self.channel}, as fitted")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, ClassVar, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -27,9 +27,6 @@ from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.stats.limits import Z
 from gyrofuse.mismatch.stats.multiplicity import sidak
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 _REACHES = (2, 8)  # samples either way
 _SIMPLER = 0.02  # share of the score that more numbers have to add, to responses of fewer and to plain gains
@@ -76,9 +73,7 @@ class ChannelTransfer(KnownPath):
         i = max(sensors, key=lambda i: float(size[i].max()))
         gain, delay = parameters[f"gain[{i}]"], parameters[f"delay[{i}]"]
         late = f"{abs(delay.value):.3g} ms {'late' if delay.value > 0 else 'early'}"
-        return Finding(
-            cls.name,
-            effect,
+        return effect.found(
             f"the output of {info.named(sensors, 'every sensor')} follows {' and '.join(best.channels)} with responses "
             f"of {2 * best.reach + 1} samples, each sensor with its own: near {f * rate:.3g} Hz most of all sensor "
             f"{info.sensors[i]} follows {names[int(size[i].argmax())]} by {gain.value:.3g} {gain.unit}, {late}",
@@ -110,7 +105,7 @@ class ChannelTransfer(KnownPath):
         """In the noise that it leaves: where a channel was left out, the simulation's is no measure of what remains."""
         return path_gains(comparison, self._path(comparison.info, comparison.n_samples), fold)
 
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         path = self._path(comparison.info, comparison.n_samples)[sensor]
         label = f"what follows {' and '.join(self.channels)}, as fitted"
         pictures.gain_on_channel(ax, comparison, sensor, path, label)

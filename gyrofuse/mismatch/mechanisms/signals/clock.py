@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import Annotated, ClassVar
 
 import torch
 from torch import Tensor
@@ -19,10 +19,6 @@ from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.signals.filters import resampled
 from gyrofuse.mismatch.signals.folds import estimation_samples, held_out_blocks
 from gyrofuse.mismatch.stats.limits import Z
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 
 _MILLION = 1e6
 _BLOCKS_AROUND = 3  # around each loss that are searched
@@ -109,9 +105,7 @@ class ClockSkew(Mechanism):
                     f"{slip.frequency * (1 + slip.skew) * rate:.8g} Hz in {who}: their clock differs by "
                     f"{_MILLION * slip.skew:.3g} ppm, or the frequency of the tone"
                 )
-        return Finding(
-            cls.name,
-            effect,
+        return effect.found(
             sentence,
             slip.p_value,
             slip.sensors,
@@ -205,7 +199,7 @@ class ClockSkew(Mechanism):
         """By how many samples the sensors are ahead at their sample `t`."""
         return self.skew * t + sum(count * (t >= at) for at, count in self.losses)
 
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         rate = comparison.info.rate
         pictures.spectrum_near(ax, comparison, sensor, self.frequency * rate, rate / comparison.n_samples)
 

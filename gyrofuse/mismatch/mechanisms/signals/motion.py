@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import Annotated, ClassVar
 
 import torch
 from torch import Tensor
@@ -17,9 +17,6 @@ from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
 from gyrofuse.mismatch.mechanisms.regimes.transient import Transient, held_out_sums, in_fours, kept_of
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import Dims
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 Span = tuple[int, int]
 
@@ -80,9 +77,7 @@ class Motion(Transient):
         moves = "moves" if len(which) == 1 else "move together"
         others = len(stretches) - 1
         more = f", and {others} more time{'s' if others > 1 else ''}" if others else ""
-        return Finding(
-            cls.name,
-            effect,
+        return effect.found(
             f"the device is not at rest: {info.named(which, 'all sensors')} {moves} from {start:.4g} s to "
             f"{stop:.4g} s{more}, by up to {float(size[largest]):.3g} {info.measure} rms (sensor "
             f"{info.sensors[largest]}); leave that part out, or give what moves it as a channel",
@@ -130,7 +125,7 @@ class Motion(Transient):
             gains[first:end] = (white.square().sum(0) - explained - torch.logdet(louder)) / 2
         return in_fours(held_out_sums(gains, fold))
 
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         first, end = self._spans(comparison.n_samples, comparison.info.rate)[0]
         around = (end - first) // 2
         pictures.transient(ax, comparison, sensor, first - around, end - first + 2 * around, None)

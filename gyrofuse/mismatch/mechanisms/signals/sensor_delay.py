@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -19,9 +19,6 @@ from gyrofuse.mismatch.signals.filters import filtered
 from gyrofuse.mismatch.signals.folds import N_JUDGED, in_fold
 from gyrofuse.mismatch.stats.limits import Z
 from gyrofuse.mismatch.stats.multiplicity import sidak
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,9 +55,7 @@ class SensorDelay(Mechanism):
             parameters[f"delay[{i}]"] = Parameter(value, value - reach, value + reach, "ms")
         largest = max(sensors, key=lambda i: abs(parameters[f"delay[{i}]"].value))
         by = parameters[f"delay[{largest}]"].value
-        return Finding(
-            cls.name,
-            cls(torch.where(late, found.delay, 0.0)),
+        return cls(torch.where(late, found.delay, 0.0)).found(
             f"what sensors share comes {'later' if by > 0 else 'earlier'} in {info.named(sensors, 'all sensors')} than "
             f"in the others, by up to {abs(by):.3g} ms (sensor {info.sensors[largest]})",
             p_value,
@@ -87,7 +82,7 @@ class SensorDelay(Mechanism):
             scores.append(phases.likelihood(self.delay) - phases.likelihood(torch.zeros_like(self.delay)))
         return torch.stack(scores)
 
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         shared = comparison.reference.coherence.abs().sum(0)[sensor]
         right = torch.where(self.delay == 0, shared, 0.0)  # against those that are right
         pictures.coherence(ax, comparison, sensor, right if bool(right.any()) else shared, in_phase=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import Annotated, ClassVar
 
 import torch
 from torch import Tensor
@@ -21,9 +21,6 @@ from gyrofuse.mismatch.signals.known_lines import line_parts, without_lines
 from gyrofuse.mismatch.signals.psd import between_bands, narrow_bands
 from gyrofuse.mismatch.signals.records import Records
 from gyrofuse.mismatch.stats.limits import Z
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,9 +61,7 @@ class TimeScale(Mechanism):
         reach = Z * found.sd
         moved = [f * info.rate for f in found.matched]
         before, after = (" and ".join(f"{f * r:.6g}" for f in moved) for r in (1.0, found.ratio))
-        return Finding(
-            cls.name,
-            effect,
+        return effect.found(
             f"the rates of recording and simulation differ: the simulation's tones at {before} Hz are at {after} Hz, "
             f"all of them {found.ratio:.6g} times as high, as where {info.rate:g} Hz were "
             f"{info.rate / found.ratio:.6g} Hz",
@@ -104,7 +99,7 @@ class TimeScale(Mechanism):
         angle = 2 * torch.pi * f * info.seconds(n_samples)
         return torch.polar(torch.ones_like(angle), angle)
 
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         rate = comparison.info.rate
         pictures.spectrum_near(ax, comparison, sensor, self.lines_hz[0] * self.ratio, rate / comparison.n_samples)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 from scipy import stats
@@ -27,9 +27,6 @@ from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples
 from gyrofuse.mismatch.stats.inclusion import included_sensors
 from gyrofuse.mismatch.stats.limits import Z
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,9 +103,7 @@ class VibrationTone(Mechanism):
         largest = max(present, key=lambda i: parameters[f"amplitude[{i}]"].value)
         info = comparison.info
         where = info.named(present, "all sensors")
-        return Finding(
-            cls.name,
-            tone,
+        return tone.found(
             f"a tone at {tone.frequency_hz:.6g} Hz in {where}, of amplitude up to "
             f"{parameters[f'amplitude[{largest}]'].value:.3g} {info.measure} (sensor {info.sensors[largest]}), "
             f"that the simulation does not have; {tone._besides(info)}",
@@ -289,7 +284,7 @@ class VibrationTone(Mechanism):
     def fit_without(self, comparison: Comparison, fold: int) -> VibrationTone:
         return self._fitted(comparison, estimation_samples(comparison.n_samples, fold))
 
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         pictures.spectrum_near(ax, comparison, sensor, self.frequency_hz, comparison.info.rate / comparison.n_samples)
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:

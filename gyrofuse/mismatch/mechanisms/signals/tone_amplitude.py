@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -18,10 +18,6 @@ from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples, signal_gains
 from gyrofuse.mismatch.signals.known_lines import resized
 from gyrofuse.mismatch.stats.limits import Z
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 
 _CERTAIN = 6.0  # standard deviations from which the simulation has a line beyond doubt
 _SEEN_SD = 3.5  # of an amplitude, below which there is none
@@ -67,9 +63,7 @@ class ToneSize(Mechanism):
             words = f"the simulation's tone at {f:.6g} Hz, of amplitude {old} {of_sensor}, is not in the recording"
         else:
             words = f"the tone at {f:.6g} Hz that the simulation has is of amplitude {new} instead of {old} {of_sensor}"
-        return Finding(
-            cls.name,
-            cls(f, torch.where(other, own, before)),
+        return cls(f, torch.where(other, own, before)).found(
             f"{words}, in {info.named(sensors, 'all sensors')}",
             sizes.p_value,
             sensors,
@@ -83,7 +77,7 @@ class ToneSize(Mechanism):
     def fit_in_place_of(cls, finding: Finding, comparison: Comparison) -> Rival | None:
         return None  # stands for no other noise
 
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         pictures.spectrum_near(ax, comparison, sensor, self.frequency_hz, comparison.info.rate / comparison.n_samples)
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, ClassVar, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -28,10 +28,6 @@ from gyrofuse.mismatch.signals.comparison import N_BLOCKS, Comparison, Recording
 from gyrofuse.mismatch.signals.dims import Dims, OfSensors
 from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED, in_fold
 from gyrofuse.mismatch.stats.limits import Z
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 
 _STRONG = 5e-4  # a slow effect leaves traces that look like another one: largest p value
 _SHARES = N_JUDGED // N_FOLDS
@@ -102,7 +98,7 @@ class SlowEffect(Mechanism, SlowTemplates):
         """For sizes of one, `(path, time)`."""
         raise NotImplementedError
 
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         path = self._effect(comparison.n_samples, comparison.info)
         pictures.means_over_time(ax, comparison, sensor, path if fitted else None)
 
@@ -264,9 +260,7 @@ def slow_finding(
     largest = max(which, key=lambda i: float(up_to[i]))
     # A block is no more than half a wavelet there.
     levels = range(int(math.log2(comparison.n_samples / N_BLOCKS)) + 1, int(math.log2(comparison.n_samples)) + 1)
-    return Finding(
-        effect.name,
-        effect,
+    return effect.found(
         f"the bias of {info.named(which)} {words}, with {article} {of} of up to "
         f"{float(up_to[largest]):.3g} {sizes[0][1]} (sensor {info.sensors[largest]})",
         scan.p_value,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -18,9 +18,6 @@ from gyrofuse.mismatch.mechanisms.mechanism import Finding
 from gyrofuse.mismatch.mechanisms.slow.slow_effect import SlowEffect, in_seconds, slow_finding, strong_scan
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import OfSensors
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +114,7 @@ class TemperatureDrift(SlowEffect):
         n = len(self.curvature)
         return replace(self, size=size, curvature=tuple(further[:n]), change=tuple(further[n:]))
 
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         at_once = 0.0 if self.change else self.lag_s * comparison.info.rate
         channel = lagged(comparison.info, self.channel, self.row, at_once, comparison.n_samples)
         path = self._effect(comparison.n_samples, comparison.info) if fitted else None

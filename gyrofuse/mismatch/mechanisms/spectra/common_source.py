@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -26,10 +26,6 @@ from gyrofuse.mismatch.signals.dims import ComplexOfSensors
 from gyrofuse.mismatch.signals.filters import filtered, noise, of_phase
 from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum
 from gyrofuse.mismatch.stats.limits import Z
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 
 _WORDS = {"white": "white noise", "ar1": "AR1 noise", "walk": "a random walk"}
 _REST = 0.01  # of a sensor's power that is its own, at least
@@ -99,7 +95,6 @@ class CommonMode(Addition):
         sign = f", with the sign reversed in {comparison.info.named(against)}" if against else ""
         share = ", as a part of the noise that each has" if term.inside else ""
         return found(
-            comparison,
             cls(term.kind, corner, gain, reference_noise(comparison), term.inside),
             shape,
             sensors,
@@ -139,7 +134,7 @@ class CommonMode(Addition):
         part = self.gain.abs().square()[:, None] * self._source(f) / self.own.spectrum(f)
         return (1 - part).clamp(min=_REST).sqrt()
 
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         pictures.coherence(ax, comparison, sensor, self.gain)
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, ClassVar, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -25,9 +25,6 @@ from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED, in_fold, sd_of_sum
 from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum
 from gyrofuse.mismatch.stats.limits import Z
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +59,7 @@ class CrossTalk(Spectral):
             parameters[f"part_of_{j + 1}[{i}]"] = Parameter(m, m - reach, m + reach, "")
         told = (found.matrix.abs() > Z * found.sd) & found.free
         sensors = tuple((told | (found.free & ~told & ~told.mT)).any(-1).nonzero()[:, 0].tolist())
-        return Finding(
-            cls.name,
-            effect,
+        return effect.found(
             f"cross-talk that the simulation does not have, in {info.named(sensors, 'all sensors')}: "
             + _largest(found.matrix, told, info),
             source.p_value,
@@ -96,7 +91,7 @@ class CrossTalk(Spectral):
         found = _mixing(comparison, ~in_fold(N_JUDGED, fold), self.mixing != 0)
         return replace(self, mixing=found.matrix)
 
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         pictures.coherence(ax, comparison, sensor, self.mixing[sensor].abs() + self.mixing[:, sensor].abs())
 
 

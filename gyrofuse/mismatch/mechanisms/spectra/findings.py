@@ -9,7 +9,6 @@ from dataclasses import replace
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import Shape
 from gyrofuse.mismatch.mechanisms.spectra.spectral import Spectral
-from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.stats.limits import Z
 
 
@@ -19,7 +18,6 @@ def spanned(number: Callable[[float], float], middle: float, sd: float, unit: st
 
 
 def found(
-    comparison: Comparison,
     effect: Spectral,
     shape: Shape,
     sensors: tuple[int, ...],
@@ -31,9 +29,7 @@ def found(
     # Of several shapes the form of all together is off: the others are yet to be found in the same bands.
     off = not shape.fits and shape.alone
     limits = {name: entry for name, entry in parameters.items() if not math.isnan(entry.value)}
-    return Finding(
-        effect.name,
-        replace(effect, company=shape.company, approximate=off),
+    return replace(effect, company=shape.company, approximate=off).found(
         sentence + _of_another_form(shape) if off else sentence,
         shape.p_value,
         sensors,

@@ -62,7 +62,6 @@ class FlickerNoise(Addition):
         where = comparison.info.named(sensors, "all sensors")
         largest = max(math.sqrt(2 * float(a[i])) for i in sensors)
         return found(
-            comparison,
             cls(a),
             shape,
             sensors,

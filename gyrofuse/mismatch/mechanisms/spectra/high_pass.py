@@ -140,7 +140,6 @@ class HighPassFilter(Filter):
         if float(inside.max()) > 1.02 * float(inside.min()):
             corners = f"between {float(inside.min()):.4g} and {float(inside.max()):.4g} Hz"
         return found(
-            comparison,
             effect,
             shape,
             sensors,

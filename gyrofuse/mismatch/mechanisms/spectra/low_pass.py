@@ -113,7 +113,6 @@ class LowPassFilter(Filter):
         if effect.undone:
             words = f"the simulation has a low-pass filter in {where} that the recording does not have, {corners}"
         return found(
-            comparison,
             effect,
             shape,
             sensors,

@@ -137,7 +137,6 @@ class NotchFilter(Filter):
         where = comparison.info.named(sensors, "all sensors")
         reach = "up to" if float(effect.depth.max()) < Notch.upper else "more than"
         return found(
-            comparison,
             effect,
             shape,
             sensors,

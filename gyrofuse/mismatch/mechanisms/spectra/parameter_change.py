@@ -101,7 +101,6 @@ class ParameterShift(Filter):
                     words.append(f"{_WORDS[k]} of sensor {comparison.info.sensors[i]} {before_it} -> {after}")
         sensors = tuple(int(i) for i in shape.term.free.any(0).nonzero()[:, 0])
         return found(
-            comparison,
             cls(base, shape.term.local),
             shape,
             sensors,

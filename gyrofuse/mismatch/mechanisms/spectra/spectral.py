@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -21,9 +21,6 @@ from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.filters import filtered
 from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +39,7 @@ class Spectral(Mechanism, SpectralTerms):
     company: tuple[Any, ...] = field(default=(), kw_only=True, metadata={"saved": False})
     approximate: bool = field(default=False, kw_only=True, metadata={"saved": False})
 
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         factor = partial(self.factor, reference_noise(comparison)) if fitted else None
         pictures.ratio_of_spectra(ax, comparison, sensor, factor)
 

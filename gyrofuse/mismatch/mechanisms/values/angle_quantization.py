@@ -78,7 +78,6 @@ class AngleQuantization(Addition):
         }
         largest = max(sensors, key=lambda i: float(q[i]))
         return found(
-            comparison,
             cls(q),
             shape,
             sensors,

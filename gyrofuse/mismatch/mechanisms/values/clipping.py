@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import Annotated, ClassVar
 
 import torch
 from torch import Tensor
@@ -17,10 +17,6 @@ from gyrofuse.mismatch.signals.dims import Dims, OfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples, held_out_blocks
 from gyrofuse.mismatch.signals.prediction_errors import left_out
 from gyrofuse.mismatch.stats.multiplicity import sidak
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 
 _CELL = 0.02  # width of a cell at the limit, sd: it bounds the log likelihood ratio of a sample there
 
@@ -59,9 +55,7 @@ class Clipping(Mechanism):
         ends = sorted({"above" if end.sign > 0 else "below" for end in found})
         at = min(found, key=lambda end: end.p_value)
         share = float(effect._clipped(comparison.recording).to(torch.float64)[list(sensors)].mean())
-        return Finding(
-            cls.name,
-            effect,
+        return effect.found(
             f"values are cut {' and '.join(ends)} in {where}, as at {at.limit:.6g} {comparison.info.measure} in sensor "
             f"{comparison.info.sensors[at.sensor]}: {100 * share:.2g} % of the samples sit at the limits",
             sidak(at.p_value, 1),
@@ -78,7 +72,7 @@ class Clipping(Mechanism):
         high = torch.where(self.high.isfinite(), part.amax(-1), self.high)
         return Clipping(low, high, part.mean(-1))
 
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         low, high = float(self.low[sensor]), float(self.high[sensor])
         limit = high if math.isfinite(high) else low
         pictures.values(ax, comparison, sensor, limit, float(comparison.recording[sensor].std()))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -21,10 +21,6 @@ from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples, held_out_blocks
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 
 _SURE = math.log(50)  # largest log likelihood ratio of one sample in the band, nats
 
@@ -78,9 +74,7 @@ class DeadBand(Mechanism):
         subtracts = found[first].subtracts
         effect = cls(numbers[0], numbers[1], centre, subtracts)
         sensors, beyond = tuple(found), ", and beyond that less the width," if subtracts else ""
-        return Finding(
-            cls.name,
-            effect,
+        return effect.found(
             f"a dead band: within {float(effect.half_width.max()):.3g} {unit} of {value:.3g} {unit} the rate is "
             f"put out as {value:.3g}{beyond} in {comparison.info.named(sensors, 'all sensors')}",
             p_value,
@@ -100,7 +94,7 @@ class DeadBand(Mechanism):
                 half_width[i] = band.half_width
         return replace(self, half_width=half_width)
 
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         pictures.values(ax, comparison, sensor, float(self.value[sensor]), 4 * float(self.half_width[sensor]))
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,9 +17,6 @@ from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import held_out_blocks
 from gyrofuse.mismatch.stats.limits import Z
 from gyrofuse.mismatch.stats.multiplicity import sidak
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,9 +54,7 @@ class HeldValues(Mechanism):
             parameters[f"rate[{i}]"] = Parameter(rate, rate - reach, rate + reach, "Hz")
         effect = cls(period, phase, seen.expected.clamp(max=0.999))
         slowest = max(found, key=lambda i: found[i].period)
-        return Finding(
-            cls.name,
-            effect,
+        return effect.found(
             f"values of {info.named(tuple(found), 'all sensors')} come at {info.rate / found[slowest].period:.6g} Hz, "
             f"slower than the samples, and are held between: each is put out {found[slowest].period:.4g} times",
             min(p_values[i] for i in found),
@@ -100,7 +95,7 @@ class HeldValues(Mechanism):
             scores[i] = torch.where(same[i], (expected / c).log(), ((1 - expected) / (1 - c)).log())
         return scores
 
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         pictures.samples(ax, comparison, sensor, max(int(self.phase[sensor]), 0), 60)
 
 

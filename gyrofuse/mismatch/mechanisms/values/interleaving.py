@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -17,9 +17,6 @@ from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples, signal_gains
 from gyrofuse.mismatch.stats.inclusion import included_sensors
 from gyrofuse.mismatch.stats.limits import Z
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,9 +50,7 @@ class Interleaving(KnownPath):
         }
         largest = max(there, key=lambda i: abs(float(effect.offset[i])))
         off = float(effect.offset[largest])
-        return Finding(
-            cls.name,
-            effect,
+        return effect.found(
             f"every second sample is off in {info.named(there, 'all sensors')}, even ones by {off:+.3g} and odd ones "
             f"by {-off:+.3g} {info.measure} (sensor {info.sensors[largest]}), as of two converters in turns, or a tone "
             "at half the rate",
@@ -81,7 +76,7 @@ class Interleaving(KnownPath):
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
         return signal_gains(comparison, self._path(comparison.info, comparison.n_samples), fold)
 
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         rate = comparison.info.rate
         pictures.spectrum_near(ax, comparison, sensor, rate / 2, rate / comparison.n_samples)
 

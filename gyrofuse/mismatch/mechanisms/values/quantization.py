@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -26,10 +26,6 @@ from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples, held_out_blocks
 from gyrofuse.mismatch.signals.lines import whitened
 from gyrofuse.mismatch.stats.limits import Z
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 
 _TABLE = 1024  # points of a law
 _EVEN = 3.0  # steps, sd: over more of them all distances from the lattice are as likely
@@ -164,9 +160,7 @@ class Quantization(Mechanism):
             words.append(
                 f"the noise of {comparison.info.named(coarse)} is so much smaller that nothing else can be told there"
             )
-        return Finding(
-            cls.name,
-            effect,
+        return effect.found(
             "; ".join(words),
             p_value,
             sensors,
@@ -190,7 +184,7 @@ class Quantization(Mechanism):
         blur = torch.sqrt(-2 * turn.abs().clamp(1e-6, 1.0).log()) / (2 * math.pi)
         return replace(self, offset=offset, blur=torch.where(self.blur > 0, blur, self.blur))
 
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         step = float(self.step[sensor]) or self.replaced[sensor]  # where only the simulation has one, of that
         pictures.distance_from_grid(ax, comparison, sensor, step, float(self.offset[sensor]))
 

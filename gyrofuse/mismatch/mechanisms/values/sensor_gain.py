@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -16,9 +16,6 @@ from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import N_JUDGED, estimation_samples, in_fold, signal_gains
 from gyrofuse.mismatch.stats.limits import Z
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +46,7 @@ class SensorGain(Mechanism):
             low, high = sorted((value / reach, value * reach))
             parameters[f"gain[{i}]"] = Parameter(value, low, high, "")
         effect = cls(found.factor)
-        return Finding(
-            cls.name,
-            effect,
+        return effect.found(
             cls._words(found, sensors, comparison),
             found.p_value,
             sensors,
@@ -104,7 +99,7 @@ class SensorGain(Mechanism):
             path = path + size[:2].mT @ basis[:2]
         return path
 
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         power = self.factor.square()[:, None]
         pictures.ratio_of_spectra(ax, comparison, sensor, (lambda f: power * torch.ones_like(f)) if fitted else None)
 

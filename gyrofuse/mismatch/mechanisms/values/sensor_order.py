@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 from scipy.optimize import linear_sum_assignment
@@ -15,9 +15,6 @@ from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,9 +58,7 @@ class SensorOrder(Mechanism):
         sensors = tuple(moved.nonzero()[:, 0].tolist())
         names = comparison.info.sensors
         words = ", ".join(f"{names[i]} is like the simulation's {names[int(place[i])]}" for i in sensors)
-        return Finding(
-            cls.name,
-            cls(tuple(place.tolist())),
+        return cls(tuple(place.tolist())).found(
             f"sensors are in another order than in the simulation: {words}, as where cables or columns are swapped",
             p_value,
             sensors,
@@ -82,7 +77,7 @@ class SensorOrder(Mechanism):
         """The same order: it is one of a few."""
         return self
 
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         pictures.ratio_of_spectra(ax, comparison, sensor, None)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -21,10 +21,6 @@ from gyrofuse.mismatch.signals.prediction_errors import predicted
 from gyrofuse.mismatch.stats.limits import Z
 from gyrofuse.mismatch.stats.multiplicity import sidak
 from gyrofuse.mismatch.stats.segments import runs_of
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 
 _TOGETHER = 0.5  # share of the repeats that all have at once, beyond chance
 _OFTEN = 1e-3  # probability of a repeat by chance, from which rows are not all the mechanism's
@@ -85,9 +81,7 @@ class StuckSamples(Mechanism):
         if effect.filler:
             values = sorted({f"{effect.filler[i]:.6g}" for i in sensors})
             what = f"samples are {' and '.join(values)} {unit}, which stands in their place"
-        return Finding(
-            cls.name,
-            effect,
+        return effect.found(
             f"{what}{hangs}{jointly} in {where}, with a probability of up to "
             f"{float(effect.probability[largest]):.3g} (sensor {comparison.info.sensors[largest]}), "
             f"where the simulation has {float(effect.by_chance[largest]):.2g}",
@@ -121,9 +115,7 @@ class StuckSamples(Mechanism):
             parameters[f"probability[{i}]"] = Parameter(share, max(share - reach, 0.0), min(share + reach, 1.0), "")
         largest = max(sensors, key=lambda i: float(effect.probability[i]))
         values = sorted({f"{filler[i]:.6g}" for i in sensors})
-        return Finding(
-            cls.name,
-            effect,
+        return effect.found(
             f"single samples are {' and '.join(values)} {info.measure}, which stands in their place"
             f"{' at the same time' if effect.together else ''} in {info.named(sensors, 'all sensors')}, with a "
             f"probability of up to {float(effect.probability[largest]):.3g} (sensor {info.sensors[largest]})",
@@ -186,7 +178,7 @@ class StuckSamples(Mechanism):
         length = torch.where(seldom, self._length, found._length)
         return replace(found, probability=probability, row=tuple(length.tolist()))
 
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         if self._single:
             spread = float(comparison.recording[sensor].std())
             pictures.values(ax, comparison, sensor, self.filler[sensor], spread)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -15,10 +15,6 @@ from gyrofuse.mismatch.detectors.spectra.band_tests import power_tails
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter, Rival
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 
 _UNITS = {
     180 / math.pi: "deg/s against rad/s",
@@ -66,9 +62,7 @@ class UnitScale(Mechanism):
     @classmethod
     def _found(cls, comparison: Comparison, factor: float, words: str) -> Finding:
         tails = power_tails(comparison)
-        return Finding(
-            cls.name,
-            cls(factor),
+        return cls(factor).found(
             f"every sensor of the recording is {factor:.4g} times the simulation, as {words} would be: "
             "give both in the same unit",
             min(float(tails.nan_to_num(nan=1.0).amin()) * tails.numel(), 1.0),
@@ -84,7 +78,7 @@ class UnitScale(Mechanism):
     def left_of(self, own: Sequence[Mechanism]) -> tuple[Mechanism, ...]:
         return tuple(effect.in_unit(self.factor) for effect in own)
 
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         pictures.ratio_of_spectra(ax, comparison, sensor, None)
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:

@@ -112,9 +112,7 @@ class Seen(NamedTuple):
                 parameters[f"phase[{i}]"] = Parameter(turn, turn - reach, turn + reach, "deg")
         other = ("resonance",) if effect.name == "drifting_tone" else ("drifting_tone",)
         alternatives = tuple(sorted({*self.rivals, *(other if self.verdict.open else ())} - {effect.name}))
-        return Finding(
-            effect.name,
-            effect,
+        return effect.found(
             sentence,
             peak.stretch.p_value,
             self.sensors,

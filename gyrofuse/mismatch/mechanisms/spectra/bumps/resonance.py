@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -19,10 +19,6 @@ from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
 from gyrofuse.mismatch.mechanisms.spectra.bumps.oscillation import Mode, OscillationOnTop, nominated, refitted_mode
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.filters import noise, of_phase
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 
 _NARROWEST = 1.5  # bins: half width of the narrowest peak that a record shows, in the place of a line
 
@@ -85,7 +81,7 @@ class Resonance(OscillationOnTop):
         built = super().apply_to_reference(comparison, generator)
         return replace(built, modes=(*built.modes, (self.mode.centre, self.mode.width)))
 
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         rate = comparison.info.rate
         pictures.spectrum_near(ax, comparison, sensor, self.mode.centre * rate, self.mode.width * rate)
 

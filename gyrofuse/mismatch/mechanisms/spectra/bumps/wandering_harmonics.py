@@ -90,9 +90,7 @@ class WanderingHarmonics(DriftingTone):
         fundamental = peak.centre * rate / family.multiple
         times = ", ".join(str(line.multiple) for line in family.lines[1:])
         itself = "" if family.multiple == 1 else f", of which it is {family.multiple} times"
-        return Finding(
-            cls.name,
-            effect,
+        return effect.found(
             f"a tone near {peak.centre * rate:.4g} Hz whose frequency wanders by about {spread_hz:.2g} Hz, in "
             f"{info.named(sensors, 'all sensors')}, of amplitude up to {float(own.amplitude.abs().max()):.3g} "
             f"{info.measure}, that the simulation does not have; {_many(len(times.split(', ')))} in step with it, at "

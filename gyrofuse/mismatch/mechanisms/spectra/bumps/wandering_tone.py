@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,10 +17,6 @@ from gyrofuse.mismatch.mechanisms.spectra.bumps.oscillation import Mode, Oscilla
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.psd import drawn_towards
 from gyrofuse.noise.processes.ar1_recursion import ar1_recursion
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 
 _SHORT = 0.05  # cycles of the width in which a phase that diffuses forgets its frequency
 _LONG = 8.0
@@ -76,7 +72,7 @@ class DriftingTone(OscillationOnTop):
     def line_width(self, parameters: Mapping[str, Parameter], comparison: Comparison) -> float | None:
         return self.mode.width * comparison.info.rate
 
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         rate = comparison.info.rate
         centre, width = self.mode.centre * rate, max(self.mode.width * rate, rate / comparison.n_samples)
         band, window = (centre - self.shown * width, centre + self.shown * width), 2 / width
