@@ -27,7 +27,7 @@ from gyrofuse.mismatch.reporting.report import MismatchReport
 from gyrofuse.mismatch.selection.backward import eliminate, nearer
 from gyrofuse.mismatch.selection.discrepancy import discrepancy_left
 from gyrofuse.mismatch.selection.forward import select
-from gyrofuse.mismatch.selection.held_out import agreement
+from gyrofuse.mismatch.selection.held_out import HeldOut, agreement
 from gyrofuse.mismatch.selection.leftovers import repair_leftovers
 from gyrofuse.mismatch.selection.null_replicates import FEWEST, twin_p_values
 from gyrofuse.mismatch.signals.comparison import Comparison
@@ -119,7 +119,11 @@ def diagnose(
             comparison=start,
             model=made or model,
             judged=verdict,
-            notes=tuple(note for note in (twice, rest_words(given), words) if note),
+            notes=tuple(
+                note
+                for note in (twice, rest_words(given), words, "" if found["mismatch"] else _told(found["held_out"]))
+                if note
+            ),
             **found,
         )
 
@@ -172,6 +176,17 @@ def diagnose(
         evidence_after=after,
         repaired=comparison,
         fit=fit_verdict(spectra, level),
+    )
+
+
+def _told(held_out: HeldOut) -> str:
+    """What is said where a classifier sees what no test does."""
+    surely = 0.8  # area under its curve
+    if held_out.auc_before < surely:
+        return ""
+    return (
+        f"A classifier tells the two apart all the same (area under the curve {held_out.auc_before:.2f}, 0.5 = "
+        "guessing), by something that no test is made for: compare which values occur, and how often."
     )
 
 

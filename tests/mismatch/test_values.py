@@ -428,3 +428,16 @@ def test_a_value_in_the_place_of_samples_leaves_other_sensors_as_they_are() -> N
     assert found.sensors == (1,)
     after = found.effect.repair(comparison, g)
     assert torch.equal(after.recording[[0, 2]], recording[[0, 2]])
+
+
+def test_what_a_classifier_sees_and_no_test_does_is_said() -> None:
+    """A converter that never gives every fourth code."""
+    rng = np.random.default_rng(5)
+    codes = np.round(rng.standard_normal((2, 2, 16384)) / 0.35)
+    recording = np.where(codes[0] % 4 == 3, codes[0] - 1, codes[0])
+    report = gf.diagnose(*(torch.from_numpy(0.35 * x) for x in (recording, codes[1])))
+    assert report.mismatch or any("A classifier tells the two apart all the same" in note for note in report.notes)
+    same = gf.diagnose(
+        *(torch.from_numpy(0.35 * x) for x in (np.round(rng.standard_normal((2, 16384)) / 0.35), codes[1]))
+    )
+    assert not any("classifier" in note for note in same.notes)
