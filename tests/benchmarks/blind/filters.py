@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from scipy import signal as sps
 
 from .bench import Bench, Part, quantity
-from .likelihood import comparison, divergence, grid, quadratic_null, solve, spectral_llr
+from .likelihood import comparison, grid, solve
+from .spectral import coloured
 
 Array = NDArray[np.float64]
 _MEMORY = 4096  # samples: of the slowest filter, whose corner is 0.003 of the rate, after which nothing is left
@@ -155,21 +156,18 @@ def _filtered(bench: Bench, nats: float, mechanism: str, name: str, made: Design
 
     size = solve(nats, lambda x: float(worth(x).sum()), *sorted(c**power_of for c in (made.lowest, made.highest)))
     corner = size**power_of
-    after, power = spectrum(corner), made.power(corner, f)
-    passes = power[::-1] if mechanism == "high_pass" else power
-    first = int(np.argmax(passes < 0.5)) if bool((passes < 0.5).any()) else len(f) - 1
-    half = f[::-1][first] if mechanism == "high_pass" else f[first]
-    return Part(
+    after, below = spectrum(corner), f[made.power(corner, f) < 0.5]
+    half = float(below.min(initial=0.5) if falling else below.max(initial=f[0])) * bench.rate
+    return coloured(
+        bench,
         mechanism,
         nats,
+        after,
         sensors,
-        lambda recording: spectral_llr(recording, after, bench.spectrum),
-        oracle_nats=float(divergence(after, bench.spectrum).sum()),
-        oracle_null=quadratic_null(after / bench.spectrum),
-        sensor_nats=tuple(float(v) for v in worth(size)[list(sensors)]),
+        worth(size),
         converter=lambda x: np.where(chosen, made.apply(corner, x), x),
         look_alikes=("parameter_shift",) if bench.looks_like_parameters(after) else (),
-        frequency_hz=float(half * bench.rate),
-        parameters={"corner": quantity(float(half * bench.rate), "Hz")},
+        frequency_hz=half,
+        parameters={"corner": quantity(half, "Hz")},
         form=name,
     )

@@ -38,7 +38,7 @@ def _fine_grid(bench: Bench) -> Array:
     return np.arange(bench.steps + 1) / (2 * bench.steps)
 
 
-def _coloured(
+def coloured(
     bench: Bench, mechanism: str, nats: float, after: Array, sensors: tuple[int, ...], each: Array, **truth: Any
 ) -> Part:
     """Gaussian noise of the spectrum `after` instead of the base's, worth `each` (sensor,) nats."""
@@ -73,7 +73,7 @@ def added(bench: Bench, mechanism: str, nats: float, unit: Array, *, broad: bool
     look_alikes: tuple[str, ...] = ("parameter_shift",) if bench.looks_like_parameters(after) else ()
     if mechanism in NARROW and (after / bench.spectrum).max() < 2:  # its envelope drowns in the noise of its band
         look_alikes += tuple(name for name in NARROW if name != mechanism)
-    return _coloured(bench, mechanism, nats, after, sensors, each, look_alikes=look_alikes), size
+    return coloured(bench, mechanism, nats, after, sensors, each, look_alikes=look_alikes), size
 
 
 def resonance(bench: Bench, nats: float) -> Part:
@@ -345,7 +345,7 @@ def low_pass(bench: Bench, nats: float) -> Part:
     def filtered(analog: Array) -> Array:
         return np.where(chosen, converter.low_pass(analog, corner), analog)
 
-    return _coloured(
+    return coloured(
         bench,
         "low_pass",
         nats,
@@ -375,7 +375,7 @@ def notch(bench: Bench, nats: float) -> Part:
         return comparison(after(depth), bench.spectrum, bench.share)
 
     depth = solve(nats, lambda x: float(worth(x).sum()), 1e-3, 0.95)
-    return _coloured(
+    return coloured(
         bench,
         "notch",
         nats,
@@ -413,7 +413,7 @@ def parameter_shift(bench: Bench, nats: float, *, only: str | None = None) -> Pa
         spectrum = changed.spectrum(bench.n)
         each = comparison(spectrum, bench.spectrum, bench.share)
         factors = dict(zip(names, np.exp(size * weights), strict=True))
-        return _coloured(
+        return coloured(
             bench,
             "parameter_shift",
             float(each.sum()),

@@ -256,6 +256,21 @@ def butterworth_poles(order: int) -> tuple[complex, ...]:
     return tuple(complex(p) for p in signal.butter(order, 1.0, analog=True, output="zpk")[1])
 
 
+def stopped(taken: Tensor, through: Tensor, depth: float | Tensor, order: int) -> Tensor:
+    """Complex response of a Butterworth filter that stops what lies at large `s = taken / through`.
+
+    Args:
+        taken, through: Of each frequency; where `through` is zero all is stopped.
+        depth: What it keeps from passing there, nepers.
+        order: Number of its poles.
+    """
+    left = taken * torch.exp(-torch.as_tensor(depth, dtype=torch.float64) / order)
+    response = torch.ones_like(left)
+    for pole in butterworth_poles(order):
+        response = response * (left - pole * through) / (taken - pole * through)
+    return response
+
+
 def _at_rest(form: _Form) -> float:
     """Response with ripples at frequency 0: with an even number of poles they start from below."""
     return 1.0 if form.order % 2 else 10 ** (-form.width / 20)

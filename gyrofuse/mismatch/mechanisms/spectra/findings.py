@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
@@ -15,6 +15,12 @@ from gyrofuse.mismatch.stats.limits import Z
 def spanned(number: Callable[[float], float], middle: float, sd: float, unit: str) -> Parameter:
     """A number that rises with an estimate of normal error, and its limits."""
     return Parameter(number(middle), number(middle - Z * sd), number(middle + Z * sd), unit)
+
+
+def half_power_words(corners: Sequence[float]) -> str:
+    """Where filters halve the power, Hz."""
+    low, high = min(corners), max(corners)
+    return f"half power at {low:.4g} Hz" if high <= 1.02 * low else f"half power between {low:.4g} and {high:.4g} Hz"
 
 
 def found(

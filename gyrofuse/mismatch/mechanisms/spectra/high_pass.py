@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.likelihoods.spectra.components import NO_SHARED, Term
-from gyrofuse.mismatch.likelihoods.spectra.filter_forms import butterworth_poles, order_of
+from gyrofuse.mismatch.likelihoods.spectra.filter_forms import order_of, stopped
 from gyrofuse.mismatch.likelihoods.spectra.fit import pieces
 from gyrofuse.mismatch.likelihoods.spectra.noise_parts import Ground
 from gyrofuse.mismatch.likelihoods.spectra.ratios import FLOOR, Ratios
 from gyrofuse.mismatch.likelihoods.spectra.starts import closest_starts
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Rival
-from gyrofuse.mismatch.mechanisms.spectra.findings import found, spanned
+from gyrofuse.mismatch.mechanisms.spectra.findings import found, half_power_words, spanned
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import chosen_shape, refit
 from gyrofuse.mismatch.mechanisms.spectra.rivals import fit_alone
 from gyrofuse.mismatch.mechanisms.spectra.spectral import Filter
@@ -135,18 +135,15 @@ class HighPassFilter(Filter):
             ]
             lowest, highest = min(one.low for one in limits), max(one.high for one in limits)
             parameters[f"corner[{i}]"] = limits[0]._replace(low=lowest, high=highest)
-        inside = rate * effect.corner[list(sensors)]
-        corners = f"at {float(inside.min()):.4g} Hz"
-        if float(inside.max()) > 1.02 * float(inside.min()):
-            corners = f"between {float(inside.min()):.4g} and {float(inside.max()):.4g} Hz"
+        inside = (rate * effect.corner[list(sensors)]).tolist()
         return found(
             effect,
             shape,
             sensors,
             parameters,
             f"a high-pass filter in {comparison.info.named(sensors, 'all sensors')} that the simulation does not have, "
-            f"half power {corners}",
-            frequency_hz=float(inside.min()),
+            f"{half_power_words(inside)}",
+            frequency_hz=min(inside),
         )
 
     @classmethod
@@ -207,11 +204,7 @@ class HighPassFilter(Filter):
 def high_pass_response(f: Tensor, number: Tensor, depth: float, kind: str) -> Tensor:
     """Complex response `(sensor, frequency)` at `f` cycles per sample, of numbers `log tan(pi f_c)` `(sensor,)`."""
     u = torch.tan(math.pi * f) / number.exp()[:, None]
-    s, least = torch.complex(torch.zeros_like(u), u), math.exp(-depth / order_of(kind))
-    response = torch.ones_like(s)
-    for pole in butterworth_poles(order_of(kind)):
-        response = response * (s - least * pole) / (s - pole)
-    return response
+    return stopped(torch.full(u.shape, -1j, dtype=torch.complex128), u, depth, order_of(kind))
 
 
 def _starts(data: Ratios, company: Sequence[Term]) -> list[HighPass]:

@@ -22,7 +22,7 @@ from gyrofuse.mismatch.likelihoods.spectra.fit import pieces
 from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios
 from gyrofuse.mismatch.likelihoods.spectra.starts import best_start, closest_starts
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter, Rival
-from gyrofuse.mismatch.mechanisms.spectra.findings import found
+from gyrofuse.mismatch.mechanisms.spectra.findings import found, half_power_words
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import chosen_shape, refit
 from gyrofuse.mismatch.mechanisms.spectra.rivals import fit_alone
 from gyrofuse.mismatch.mechanisms.spectra.spectral import Filter
@@ -105,9 +105,7 @@ class LowPassFilter(Filter):
         inside = [float(corner[i]) for i in sensors if float(corner[i]) <= rate / 2]
         corners = "more than half of the power still passes at half the rate"
         if inside:
-            corners = f"half power at {min(inside):.4g} Hz"
-        if inside and max(inside) > 1.02 * min(inside):
-            corners = f"half power between {min(inside):.4g} and {max(inside):.4g} Hz"
+            corners = half_power_words(inside)
         effect = cls.of(term)
         words = f"a low-pass filter in {where} that the simulation does not have, {corners}"
         if effect.undone:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.likelihoods.spectra.components import Term
-from gyrofuse.mismatch.likelihoods.spectra.filter_forms import butterworth_poles, order_of
+from gyrofuse.mismatch.likelihoods.spectra.filter_forms import order_of, stopped
 from gyrofuse.mismatch.likelihoods.spectra.fit import pieces
 from gyrofuse.mismatch.likelihoods.spectra.noise_parts import Ground
 from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios
@@ -177,13 +177,9 @@ class NotchFilter(Filter):
 
 def notch_response(f: Tensor, centre: float, width: float, depth: Tensor, kind: str) -> Tensor:
     """Complex response `(sensor, frequency)` at `f` cycles per sample of notches of depth `(sensor,)`."""
-    u, order = _over_centre(f, torch.tensor(centre, dtype=torch.float64), kind), order_of(kind)
-    through, taken = 1 - u.square(), torch.complex(torch.zeros_like(u), max(width, 1e-9) * u)
-    left = (-depth / order).exp()[:, None] * taken
-    response = torch.ones(left.shape, dtype=left.dtype)
-    for pole in butterworth_poles(order):
-        response = response * (left - pole * through) / (taken - pole * through)
-    return response
+    u = _over_centre(f, torch.tensor(centre, dtype=torch.float64), kind)
+    taken = torch.complex(torch.zeros_like(u), max(width, 1e-9) * u)
+    return stopped(taken, 1 - u.square(), depth[:, None], order_of(kind))
 
 
 def _over_centre(f: Tensor, centre: Tensor, kind: str) -> Tensor:

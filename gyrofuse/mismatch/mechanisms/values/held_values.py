@@ -11,7 +11,7 @@ from torch import Tensor
 from gyrofuse.mismatch.detectors.values.values import repeats
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
-from gyrofuse.mismatch.mechanisms.values.stuck_samples import StuckSamples
+from gyrofuse.mismatch.mechanisms.values.stuck_samples import StuckSamples, repeat_scores
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import held_out_blocks
@@ -64,17 +64,15 @@ class HeldValues(Mechanism):
             gain=float(effect._scores(comparison).sum()),
         )
 
-    def _fresh(self, n: int, sensor: int) -> Tensor:
-        """Samples that bring a new value, `(time,)`."""
-        place = ((torch.arange(n + 1, dtype=torch.float64) - 1 - self.phase[sensor]) / self.period[sensor]).floor()
-        return place.diff() > 0
+    def _fresh(self, n: int) -> Tensor:
+        """Samples that bring a new value, `(sensor, time)`."""
+        at = torch.arange(-1, n, dtype=torch.float64) - self.phase[:, None]
+        return (at / self.period[:, None]).floor().diff() > 0
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
-        held, n = signal.clone(), signal.shape[-1]
-        for i in (self.period > 1).nonzero()[:, 0].tolist():
-            source = torch.where(self._fresh(n, i), torch.arange(n), 0).cummax(-1).values
-            held[..., i, :] = signal[..., i, source]
-        return held
+        n = signal.shape[-1]
+        source = torch.where(self._fresh(n), torch.arange(n), 0).cummax(-1).values
+        return signal.gather(-1, source.expand(signal.shape))
 
     def fit_without(self, comparison: Comparison, fold: int) -> Mechanism:
         """A clock is known from whatever part of the record."""
@@ -88,12 +86,9 @@ class HeldValues(Mechanism):
         seldom = 1e-3  # probability that a value is not held
         same = repeats(comparison).same
         chance = self.by_chance.clamp(min=0.5 / comparison.reference.signal[:, 0].numel())
-        scores = torch.zeros(same.shape, dtype=torch.float64)
-        for i in (self.period > 1).nonzero()[:, 0].tolist():
-            c = float(chance[i])
-            expected = torch.where(self._fresh(same.shape[-1], i), c, max(1 - seldom, c))
-            scores[i] = torch.where(same[i], (expected / c).log(), ((1 - expected) / (1 - c)).log())
-        return scores
+        chance = chance[:, None]
+        expected = torch.where(self._fresh(same.shape[-1]), chance, chance.clamp(min=1 - seldom))
+        return repeat_scores(same, expected, chance)
 
     def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         pictures.samples(ax, comparison, sensor, max(int(self.phase[sensor]), 0), 60)

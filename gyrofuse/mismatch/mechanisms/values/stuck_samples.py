@@ -259,8 +259,13 @@ class StuckSamples(Mechanism):
             held[i] = torch.where(before, 1 - leave[i], enter[i] if seen == 1 else 0.0)
         chance = chance[:, None]
         stuck = (chance + held * (1 - chance)).clamp(min=1e-9, max=1 - 1e-9)
-        scores = torch.where(same, (stuck / chance).log(), ((1 - stuck) / (1 - chance)).log())
+        scores = repeat_scores(same, stuck, chance)
         return torch.where(self.probability[:, None] > 0, scores, 0.0)
+
+
+def repeat_scores(same: Tensor, expected: Tensor, chance: Tensor) -> Tensor:
+    """Log likelihood ratio of repeats `(sensor, time)` that have a probability, over the one that chance has."""
+    return torch.where(same, (expected / chance).log(), ((1 - expected) / (1 - chance)).log())
 
 
 def run_lengths(true: Tensor) -> Tensor:
