@@ -70,6 +70,8 @@ class Comparison:
         analog: The simulation's samples `(record, sensor, time)` before the converter; where they came rounded, as
             they may have been.
         converter: What it does to them, with the place of each in the chain.
+        rounding: Variance that rounding adds at the end of both sides, after all that is analogue, `(sensor,)`; None
+            without.
         bent: Factors `(sensor, frequency)` by which powers were changed of what was built in though its form is another
             one, or by which its own scatter: what is left where it acts is a matter of it.
         modes: Centre and half width of narrow noise that was built in, cycles per sample: it is no line, however like
@@ -84,6 +86,7 @@ class Comparison:
     reference: Records
     analog: Tensor
     converter: tuple[tuple[int, Callable[[Tensor], Tensor]], ...] = ()
+    rounding: Tensor | None = None
     bent: tuple[Callable[[Tensor], Tensor], ...] = ()
     modes: tuple[tuple[float, float], ...] = ()
     filters: tuple[tuple[str, Callable[[Tensor], Tensor]], ...] = ()
@@ -184,7 +187,7 @@ class Comparison:
         """With the simulation's numbers times a factor, after its converter."""
         converter = tuple((place, partial(_in_unit, act, factor)) for place, act in self.converter)
         reference = replace(self.reference, signal=factor * self.reference.signal)
-        return replace(self, reference=reference, analog=factor * self.analog, converter=converter)
+        return replace(self, reference=reference, analog=factor * self.analog, converter=converter, rounding=None)
 
     def with_stand_ins(self, sensors: Sequence[int], generator: torch.Generator) -> Comparison:
         """With white noise in the place of sensors in which nothing else can be seen, of one law on both sides.
@@ -209,6 +212,7 @@ class Comparison:
             reference=replace(self.reference, signal=reference),
             analog=analog,
             converter=converter,
+            rounding=None if self.rounding is None else torch.where(hidden[:, 0], 0.0, self.rounding),
         )
 
     def without_converter(self, place: int, sensors: Sequence[int]) -> Comparison:

@@ -50,7 +50,8 @@ def spectral_gains(
     """Gain in log score of each block held out, `(block,)`, nats.
 
     The likelihood of cosine transforms, whose ordinates are independent for white noise and random walks. They are
-    real: noise that sensors share a quarter of a cycle apart does not count. Blocks are short: next to a filter's edge,
+    real: noise that sensors share a quarter of a cycle apart does not count. What rounds the values of both sides comes
+    last and stays as it is. Blocks are short: next to a filter's edge,
     in its stop band and at its zeros most of an ordinate's power is what leaks in from elsewhere, so that spectra are
     seen as a block shows them. Lines that the simulation has as well are no noise.
 
@@ -68,10 +69,21 @@ def spectral_gains(
     noise = comparison.reference.density(f).minimum(comparison.base.spectrum(f))
     plain = torch.diag_embed(noise.mT).to(torch.complex128)
     simulated = plain if before is None else before(plain, f)
-    after, without = (seen_in_block(matrices.real)[_FIRST:] for matrices in (spectra(plain, f), simulated))
+    last = last_in_chain(comparison, plain)
+    made = spectra(plain - last, f) + last
+    after, without = (seen_in_block(matrices.real)[_FIRST:] for matrices in (made, simulated))
     came = comparison.observed.noise[0]
     own = came if left is comparison.recording else without_lines(left, comparison.observed.lines)
     return _log_scores(own, after, fold) - _log_scores(came, without, fold)
+
+
+def last_in_chain(comparison: Comparison, matrices: Tensor) -> Tensor:
+    """What rounding is of the simulation's cross-spectra `(frequency, sensor, sensor)`."""
+    if comparison.rounding is None:
+        return torch.zeros_like(matrices)
+    most = 0.99  # of a power
+    power = matrices.diagonal(dim1=-2, dim2=-1).real
+    return torch.diag_embed(comparison.rounding.minimum(most * power)).to(matrices.dtype)
 
 
 def seen_in_block(spectra: Tensor) -> Tensor:

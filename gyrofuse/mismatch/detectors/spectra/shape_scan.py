@@ -192,10 +192,10 @@ def _shapes(data: Ratios, n_samples: int) -> Shapes:
         AR1._spectrum(f, phi, (1 - phi).square()),
         oscillation(f, *_peaks(n_samples).mT[..., None]),
     ]
-    relative = mean_of(torch.cat(added))[:, None] / ground.mean  # (shape, sensor, band)
+    relative = mean_of(torch.cat(added))[:, None] / ground.whole  # (shape, sensor, band)
     corners = torch.tensor([0.01, 0.04, 0.12, 0.35], dtype=torch.float64)
     passed = filter_power("sampled", filter_strength("sampled", corners), f)
-    filtered = (mean_of(ground.density * passed[:, None]) / ground.mean).log()
+    filtered = (ground.whole - ground.mean + mean_of(ground.density * passed[:, None])).log() - ground.whole.log()
     information = (data.information[:, None] * data.usable).mT
 
     def unit(weak: Tensor) -> Tensor:

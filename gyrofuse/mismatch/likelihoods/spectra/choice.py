@@ -182,7 +182,7 @@ def _coherent(data: Ratios, before: Tensor, after: Fit) -> bool:
     gained = after.gain - float((log_gain(data, before) + power_gains(data, after.power).sum(-1)).sum())
     gained += float(power_gains(data, powers(before)).sum())
     source = data.ground.bands.mean_of(term.shape(data.ground, term.shared))  # (band,)
-    share = term.variance * source[:, None] / (data.ground.mean.mT * after.power)
+    share = term.variance * source[:, None] / (data.ground.whole.mT * after.power)
     second = share.topk(2).values[:, -1]
     has = second > 0.3 * second.max()  # bands that show the source in two sensors
     few = (2 * data.n_sensors + 11) / (6 * float(data.d[has].sum()) + 1e-9)

@@ -141,7 +141,7 @@ class Common(Term):
         """
         p = excess.shape[-1]
         nothing = cls(torch.zeros(2, p, dtype=torch.float64), torch.ones(2, p, dtype=torch.bool), shared, kind)
-        level = ground.mean.mT.sqrt()
+        level = ground.whole.mT.sqrt()
         c = ground.bands.mean_of(nothing.shape(ground, shared))  # (band,)
         size = c[:, None, None] / (level[:, :, None] * level[:, None, :])
         weight = (information[:, None, None] * size).to(excess.dtype)

@@ -145,6 +145,12 @@ def reference_noise(comparison: Comparison) -> NoiseSpectrum:
 
 
 @derived
+def analog_noise(comparison: Comparison) -> NoiseSpectrum:
+    """The same before the converter."""
+    return Ground.of(reference_noise(comparison), block_spectra(comparison).bands, comparison.rounding).base
+
+
+@derived
 def shared_ordinates(comparison: Comparison) -> tuple[Tensor, Tensor]:
     """Complex ordinates that a sensor shares with the others, in the simulation and in the recording, `(sensor,)`.
 
@@ -197,9 +203,9 @@ def ratios(
     for factor in () if formed else comparison.bent:
         changed = both.bands.mean_of(factor(both.bands.nodes))  # (sensor, band)
         usable[(changed.clamp(min=1e-300).log().abs() > _CHANGED).mT] = 0.0
-    ground = Ground(reference_noise(comparison), both.bands)
+    ground = Ground.of(reference_noise(comparison), both.bands, comparison.rounding)
     power = reference.diagonal(dim1=-2, dim2=-1).real
-    size = torch.where(power > 0, power, ground.mean.mT).rsqrt()
+    size = torch.where(power > 0, power, ground.whole.mT).rsqrt()
     expected = torch.eye(comparison.n_sensors, dtype=reference.dtype).expand_as(reference)
     if not independent:
         expected = smooth_coherence(reference * (size[:, :, None] * size[:, None, :]), s)

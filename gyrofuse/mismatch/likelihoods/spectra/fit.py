@@ -233,7 +233,8 @@ class Pieces(NamedTuple):
         """Cross-spectra over the reference's powers, `(..., band, sensor, sensor)`."""
         ground, mean_of = data.ground, data.ground.bands.mean_of
         size = (mean_of(self.factor * self.filters * ground.density) / self._own(ground)).clamp(min=0).sqrt().mT
-        extra = (mean_of(self.added * self.filters) / self._own(ground)).mT
+        share, last = ground.rounded
+        extra = (mean_of(self.added * self.filters) / self._own(ground)).mT * share + last * (1 - size.square())
         own = data.expected * (size[..., :, None] * size[..., None, :]) * self._turned() + torch.diag_embed(extra)
         return own if self.common is None else own + self.common * self.passed(ground)
 
@@ -243,7 +244,7 @@ class Pieces(NamedTuple):
         return gain[..., :, None] * gain[..., None, :] * self._turned()
 
     def _own(self, ground: Ground) -> Tensor:
-        """The reference's powers, had it what is undone, `(..., sensor, band)`."""
+        """The reference's powers before the converter, had it what is undone, `(..., sensor, band)`."""
         return ground.mean if self.undone is None else ground.bands.mean_of(self.undone * ground.density)
 
     def _turned(self) -> Tensor | float:
@@ -253,7 +254,9 @@ class Pieces(NamedTuple):
     def power(self, data: Ratios) -> Tensor:
         """Powers over the reference's, `(..., band, sensor)`."""
         ground, mean_of = data.ground, data.ground.bands.mean_of
+        share, last = ground.rounded
         own = (mean_of((self.factor * ground.density + self.added) * self.filters) / self._own(ground)).mT
+        own = own * share + last
         if self.common is None:
             return own
         return own + powers(self.common) * (mean_of(self.filters) * ground.mean / self._own(ground)).mT
@@ -281,7 +284,7 @@ def pieces(data: Ratios, terms: Sequence[Term]) -> Pieces:
 
 def _relative(ground: Ground, density: Tensor) -> Tensor:
     """Density `(..., node)` of a source over the noise of pairs of sensors, `(..., band, sensor, sensor)`."""
-    level = ground.mean.mT.rsqrt()
+    level = ground.whole.mT.rsqrt()
     return ground.bands.mean_of(density)[..., None, None] * (level[:, :, None] * level[:, None, :])
 
 

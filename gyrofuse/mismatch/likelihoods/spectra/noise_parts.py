@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -140,12 +140,24 @@ class Ground:
     """The noise of a simulation in bands.
 
     Attributes:
-        base: Spectrum of the noise.
+        base: Spectrum of the noise, as it comes to the converter.
         bands: Where spectra are compared.
+        rounding: Variance that the converters of both sides add to it at last, `(sensor,)`; None without.
     """
 
     base: NoiseSpectrum
     bands: Bands
+    rounding: Tensor | None = None
+
+    @classmethod
+    def of(cls, base: NoiseSpectrum, bands: Bands, rounding: Tensor | None) -> Ground:
+        """Of the noise as it left the converter."""
+        if rounding is None or not bool(rounding.any()):
+            return cls(base, bands)
+        most = 0.999  # of the white noise
+        rounding = rounding.minimum(most * base.coefficients[:, 0])
+        rest = torch.cat([base.coefficients[:, :1] - rounding[:, None], base.coefficients[:, 1:]], 1)
+        return cls(replace(base, coefficients=rest), bands, rounding)
 
     @cached_property
     def nodes(self) -> Tensor:
@@ -165,6 +177,17 @@ class Ground:
     def mean(self) -> Tensor:
         """`(sensor, band)`."""
         return self.bands.mean_of(self.density)
+
+    @cached_property
+    def whole(self) -> Tensor:
+        """The same after the converter, `(sensor, band)`."""
+        return self.mean if self.rounding is None else self.mean + self.rounding[:, None]
+
+    @cached_property
+    def rounded(self) -> tuple[Tensor | float, Tensor | float]:
+        """Shares of a power that came to the converter, and that it added, `(band, sensor)`."""
+        share = 1.0 if self.rounding is None else (self.mean / self.whole).mT
+        return share, 1 - share
 
     @cached_property
     def matters(self) -> Tensor:

@@ -85,7 +85,7 @@ class Ratios:
         """
         (matrices, d), (power, s) = observed, reference
         known = (s > 0).to(d.dtype)
-        power = torch.where(known[:, None] > 0, power.clamp(min=1e-300), ground.mean.mT)
+        power = torch.where(known[:, None] > 0, power.clamp(min=1e-300), ground.whole.mT)
         size = power.rsqrt()
         pair_dof = known * (d if independent else d * s / (d + s).clamp(min=1e-300))
         ratios = matrices * (size[:, :, None] * size[:, None, :])

@@ -197,7 +197,7 @@ def best_bump(data: Ratios, company: Sequence[Term], shapes: Tensor) -> Peak | N
     before = powers(data_model(data, company))  # (band, sensor)
     centre, width = shapes[:, 0, None], shapes[:, 1, None]
     profile = oscillation(ground.nodes, centre, width)  # (place of a bump, place)
-    shown = ground.bands.mean_of(profile[:, None] * filters) / ground.mean  # (peak, sensor, band)
+    shown = ground.bands.mean_of(profile[:, None] * filters) / ground.whole  # (peak, sensor, band)
     at = (shown / before.mT).amax(-1)  # highest over what there is, of variance one, (peak, sensor)
     size = heights[:, None, None] / at.clamp(min=1e-300)
     changed = before + (size[..., None] * shown).transpose(-1, -2)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.detectors.spectra.power_differs import power_differs
 from gyrofuse.mismatch.likelihoods.spectra.components import Shift, Term
-from gyrofuse.mismatch.likelihoods.spectra.data import block_spectra, reference_noise
+from gyrofuse.mismatch.likelihoods.spectra.data import block_spectra, analog_noise
 from gyrofuse.mismatch.likelihoods.spectra.fit import pieces, powers
 from gyrofuse.mismatch.likelihoods.spectra.noise_parts import Parts
 from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios
@@ -76,7 +76,7 @@ class ParameterShift(Filter):
         if shape is None:
             return None
         parameters, words, lacking = {}, [], set()
-        base = reference_noise(comparison)
+        base = analog_noise(comparison)
         before, least = _numbers(base, comparison.info.rate, comparison.info.measure)
         for i in range(comparison.n_sensors):
             for k, name in enumerate(_PARTS):
@@ -129,7 +129,7 @@ class ParameterShift(Filter):
 
     @classmethod
     def from_term(cls, term: Term, comparison: Comparison) -> ParameterShift | None:
-        return cls(reference_noise(comparison), term.local) if isinstance(term, Shift) else None
+        return cls(analog_noise(comparison), term.local) if isinstance(term, Shift) else None
 
     def response(self, f: Tensor) -> Tensor:
         parts = Parts(self.base, f.clamp(min=0.5 / self.base.n_samples))
