@@ -30,7 +30,7 @@ from gyrofuse.mismatch.stats.limits import Z
 _TABLE = 1024  # points of a law
 _EVEN = 3.0  # steps, sd: over more of them all distances from the lattice are as likely
 _TAILS = 6.0  # sd
-_TOO_COARSE = 0.75  # rms change between samples, steps: noise of 0.45 steps and the rounding itself
+_TOO_COARSE = 0.4  # rms change between samples, steps: of white noise that of 0.28 steps
 _UNDONE = 1.25  # sd of a sample given its past: a step's largest at which the rounded value can be estimated
 _STEEPEST, _FLAT = 8.0, 1e-4  # slopes of a logarithm of density over a step
 _RIDGE = 1e-3  # of correlations
