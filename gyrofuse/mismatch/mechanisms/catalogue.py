@@ -55,6 +55,7 @@ from gyrofuse.mismatch.mechanisms.spectra.cross_talk import CrossTalk
 from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.spectra.high_pass import HighPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter
+from gyrofuse.mismatch.mechanisms.spectra.moved_low_pass import MovedLowPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.notch import NotchFilter
 from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
 from gyrofuse.mismatch.mechanisms.values.angle_quantization import AngleQuantization
@@ -94,6 +95,7 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (
         ParameterShift,
         LowPassFilter,
+        MovedLowPassFilter,
         HighPassFilter,
         NotchFilter,
         Resonance,

@@ -65,8 +65,9 @@ def spectral_gains(
     block = comparison.n_samples // N_JUDGED
     f = torch.arange(block + 1, dtype=torch.float64) / (2 * block)
     f[0] = f[1] / 2  # nothing of a block's mean is in its other ordinates
-    # Simple spectra have no stop bands and no zeros. Humps that they lack are nothing to judge others beside.
-    noise = comparison.reference.density(f).minimum(comparison.base.spectrum(f))
+    # Humps that simple spectra lack are nothing to judge others beside. Where they lack a stop band they are off elsewhere.
+    density, base, stopped = comparison.reference.density(f), comparison.base.spectrum(f), 0.3
+    noise = torch.where((density / base).amin(-1, keepdim=True) < stopped, density, density.minimum(base))
     plain = torch.diag_embed(noise.mT).to(torch.complex128)
     simulated = plain if before is None else before(plain, f)
     last = last_in_chain(comparison, plain)

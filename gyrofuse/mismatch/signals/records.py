@@ -223,14 +223,18 @@ class Records:
         narrow = narrow_bands(self.bands.n_samples)
         power, chance = median_powers(self.steady, narrow)
         apart = (power.clamp(min=1e-300) / narrow.mean_of(self.base.spectrum(narrow.nodes)).clamp(min=1e-300)).log()
-        plain = 4.0  # times the variance of chance: of many narrow bands some stand out
+        plain, beside = 4.0, 4  # times the variance of chance: of many bands some stand out; bands on either side
         known = chance.isfinite()
         if not bool(known.any()):
             return torch.zeros_like(apart)
-        ripple = drawn_towards(apart, plain * chance, 0.0)
+        # What neighbours have alike is no chance of theirs.
+        edges = torch.nn.functional.pad(apart[:, known], (beside, beside), mode="replicate")
+        alike = torch.nn.functional.avg_pool1d(edges, 2 * beside + 1, 1)
+        alike = drawn_towards(alike, plain * chance[known] / (2 * beside + 1), 0.0)
+        ripple = drawn_towards(apart[:, known], plain * chance[known], alike)
         # Where bands are too few to tell it goes on as in the next one: a high-pass has no floor below.
         place = torch.arange(len(known))
-        return ripple[:, known][:, (place[:, None] - place[known]).abs().argmin(1)]
+        return ripple[:, (place[:, None] - place[known]).abs().argmin(1)]
 
     def density(self, f: Tensor) -> Tensor:
         """Density per sample of base and ripple `(sensor, frequency)` at `f` cycles per sample."""

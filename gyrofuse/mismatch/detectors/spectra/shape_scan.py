@@ -195,7 +195,8 @@ def _shapes(data: Ratios, n_samples: int) -> Shapes:
     relative = mean_of(torch.cat(added))[:, None] / ground.whole  # (shape, sensor, band)
     corners = torch.tensor([0.01, 0.04, 0.12, 0.35], dtype=torch.float64)
     passed = filter_power("sampled", filter_strength("sampled", corners), f)
-    filtered = (ground.whole - ground.mean + mean_of(ground.density * passed[:, None])).log() - ground.whole.log()
+    rounding = 0.0 if ground.rounding is None else ground.rounding
+    filtered = mean_of(ground.density * passed[:, None]) / ground.mean * (1 - rounding) + rounding
     information = (data.information[:, None] * data.usable).mT
 
     def unit(weak: Tensor) -> Tensor:
@@ -203,7 +204,7 @@ def _shapes(data: Ratios, n_samples: int) -> Shapes:
         return weak / length.clamp(min=1e-300)
 
     sizes = _SIZES[:, None, None, None]
-    linear = torch.cat([unit(filtered), unit(torch.ones_like(filtered[:1]))])
+    linear = torch.cat([unit(filtered.log()), unit(torch.ones_like(filtered[:1]))])
     log_factors = torch.cat([sizes * linear, torch.log1p(sizes * unit(relative))], 1)  # (size, shape, sensor, band)
     counts = torch.tensor([len(filtered), 1, *(len(part) for part in added)])
     prior = -(counts * len(counts) * len(_SIZES)).to(torch.float64).log().repeat_interleave(counts)

@@ -19,7 +19,7 @@ from gyrofuse.mismatch.likelihoods.spectra.common_sources import Common
 from gyrofuse.mismatch.likelihoods.spectra.components import Term
 from gyrofuse.mismatch.likelihoods.spectra.fit import Fit, data_model, fit, pieces, powers, prior_cost
 from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios, correlations, log_gain, power_gains
-from gyrofuse.mismatch.likelihoods.spectra.starts import best_start, candidates, levels, pairs
+from gyrofuse.mismatch.likelihoods.spectra.starts import best_start, candidates, levels
 from gyrofuse.mismatch.stats.inclusion import included_sensors
 
 SURE_GAIN = 2.5  # standard deviations from zero of a sensor's gain that it surely has: 1 % by chance
@@ -48,8 +48,6 @@ def best_terms(data: Ratios, *, differ: bool) -> Choice:
         likeliest = _likeliest(data, now)
         if differ and all(term.acts == "add" for term in now):
             likeliest += _levels_beside(data, now)
-        if differ:
-            likeliest += [fit(data, [*now, *pair]) for pair in pairs(data, now)]
         tried = [_varied(data, _pruned(data, f)) for f in likeliest]
         tried = [f for f in tried if evidence(data, f) > value]
         earned = [f for f in tried if best is None or _earned(data, best, f, f.terms[-1])]

@@ -13,7 +13,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -147,7 +147,23 @@ def reference_noise(comparison: Comparison) -> NoiseSpectrum:
 @derived
 def analog_noise(comparison: Comparison) -> NoiseSpectrum:
     """The same before the converter."""
-    return Ground.of(reference_noise(comparison), block_spectra(comparison).bands, comparison.rounding).base
+    base = reference_noise(comparison)
+    if comparison.rounding is None:
+        return base
+    most = 0.999  # of the white noise
+    white = base.coefficients[:, 0] - comparison.rounding.minimum(most * base.coefficients[:, 0])
+    return replace(base, coefficients=torch.cat([white[:, None], base.coefficients[:, 1:]], 1))
+
+
+def _ground(comparison: Comparison) -> Ground:
+    """The simulation's noise before the converter, and what that adds."""
+    bands, rounding, most = block_spectra(comparison).bands, comparison.rounding, 0.999
+    if rounding is not None and bool(rounding.any()):
+        whole = bands.mean_of(comparison.reference.density(bands.nodes))
+        rounding = (rounding[:, None] / whole).clamp(max=most)
+    else:
+        rounding = None
+    return Ground(analog_noise(comparison), bands, rounding)
 
 
 @derived
@@ -203,7 +219,7 @@ def ratios(
     for factor in () if formed else comparison.bent:
         changed = both.bands.mean_of(factor(both.bands.nodes))  # (sensor, band)
         usable[(changed.clamp(min=1e-300).log().abs() > _CHANGED).mT] = 0.0
-    ground = Ground.of(reference_noise(comparison), both.bands, comparison.rounding)
+    ground = _ground(comparison)
     power = reference.diagonal(dim1=-2, dim2=-1).real
     size = torch.where(power > 0, power, ground.whole.mT).rsqrt()
     expected = torch.eye(comparison.n_sensors, dtype=reference.dtype).expand_as(reference)

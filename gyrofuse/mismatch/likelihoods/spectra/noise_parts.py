@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import torch
@@ -142,22 +142,12 @@ class Ground:
     Attributes:
         base: Spectrum of the noise, as it comes to the converter.
         bands: Where spectra are compared.
-        rounding: Variance that the converters of both sides add to it at last, `(sensor,)`; None without.
+        rounding: Share of the powers that the converters of both sides add at last, `(sensor, band)`; None without.
     """
 
     base: NoiseSpectrum
     bands: Bands
     rounding: Tensor | None = None
-
-    @classmethod
-    def of(cls, base: NoiseSpectrum, bands: Bands, rounding: Tensor | None) -> Ground:
-        """Of the noise as it left the converter."""
-        if rounding is None or not bool(rounding.any()):
-            return cls(base, bands)
-        most = 0.999  # of the white noise
-        rounding = rounding.minimum(most * base.coefficients[:, 0])
-        rest = torch.cat([base.coefficients[:, :1] - rounding[:, None], base.coefficients[:, 1:]], 1)
-        return cls(replace(base, coefficients=rest), bands, rounding)
 
     @cached_property
     def nodes(self) -> Tensor:
@@ -181,13 +171,12 @@ class Ground:
     @cached_property
     def whole(self) -> Tensor:
         """The same after the converter, `(sensor, band)`."""
-        return self.mean if self.rounding is None else self.mean + self.rounding[:, None]
+        return self.mean if self.rounding is None else self.mean / (1 - self.rounding)
 
     @cached_property
     def rounded(self) -> tuple[Tensor | float, Tensor | float]:
         """Shares of a power that came to the converter, and that it added, `(band, sensor)`."""
-        share = 1.0 if self.rounding is None else (self.mean / self.whole).mT
-        return share, 1 - share
+        return (1.0, 0.0) if self.rounding is None else (1 - self.rounding.mT, self.rounding.mT)
 
     @cached_property
     def matters(self) -> Tensor:

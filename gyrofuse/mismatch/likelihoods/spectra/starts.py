@@ -43,11 +43,6 @@ class SpectralTerms:
         return ()
 
     @classmethod
-    def pairs(cls, data: Ratios, company: Sequence[Term]) -> Iterable[tuple[Term, Term]]:
-        """Two of its terms at once, where one alone would be beside the point; none by default."""
-        return ()
-
-    @classmethod
     def levels(cls, data: Ratios, passed: Tensor) -> Iterable[Term]:
         """Terms that set the level of the noise, at those of the recording in bands `(band,)`; none by default."""
         return ()
@@ -69,12 +64,6 @@ def candidates(data: Ratios, company: Sequence[Term], *, beside_levels: bool = F
     for kind in declared(SpectralTerms):
         if not beside_levels or kind.leaves_levels or kind.made_of == "filter":
             yield from kind.starts(data, company)
-
-
-def pairs(data: Ratios, company: Sequence[Term]) -> Iterator[tuple[Term, Term]]:
-    """Two terms at once to add to some, of all mechanisms that declare any."""
-    for kind in declared(SpectralTerms):
-        yield from kind.pairs(data, company)
 
 
 def other_forms(data: Ratios, term: Term, company: Sequence[Term]) -> Iterator[Term]:

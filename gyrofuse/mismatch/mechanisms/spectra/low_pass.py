@@ -20,7 +20,7 @@ from gyrofuse.mismatch.likelihoods.spectra.filter_forms import (
 )
 from gyrofuse.mismatch.likelihoods.spectra.fit import pieces
 from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios
-from gyrofuse.mismatch.likelihoods.spectra.starts import best_start, closest_starts
+from gyrofuse.mismatch.likelihoods.spectra.starts import closest_starts
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter, Rival
 from gyrofuse.mismatch.mechanisms.spectra.findings import found, half_power_words
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import chosen_shape, refit
@@ -58,25 +58,8 @@ class LowPassFilter(Filter):
         if LowPass not in there:
             likeliest = 3  # forms
             yield from filter_starts(data, company)[:likeliest]
-        if SimulatedLowPass not in there and _falls(data):
+        if SimulatedLowPass not in there and falls(data):
             yield from filter_starts(data, company, SimulatedLowPass)[:1]
-
-    @classmethod
-    def pairs(cls, data: Ratios, company: Sequence[Term]) -> Iterable[tuple[Term, Term]]:
-        """The simulation's filter and the recording's, of one form and other corners: their ratio is no filter."""
-        if not _falls(data) or any(isinstance(term, LowPass) for term in company):
-            return ()
-        beside = pieces(data, company)
-        found: list[tuple[float, tuple[Term, Term]]] = []
-        for kind in UNDONE:
-            own, grid = SimulatedLowPass.starts(data.ground, kind), LowPass.starts(data.ground, kind)
-            for number in own.local[::2]:
-                simulated = replace(own, local=number.expand(1, data.n_sensors))
-                values = simulated.values(data.ground, simulated.local, simulated.shared)
-                start, gain = best_start(data, beside.with_term("undo", values), grid)
-                if float(start.local.mean()) > float(number):  # a lower corner than the simulation's is a filter more
-                    found.append((gain, (simulated, start)))
-        return [max(found, key=lambda entry: entry[0])[1]] if found else ()
 
     @classmethod
     def forms(cls, data: Ratios, term: Term, company: Sequence[Term]) -> Iterable[Term]:
@@ -157,7 +140,7 @@ def filter_starts(data: Ratios, company: Sequence[Term], form: type[LowPass] = L
     return [start for start in found if isinstance(start, LowPass)]
 
 
-def _falls(data: Ratios) -> bool:
+def falls(data: Ratios) -> bool:
     """Whether the simulation's noise falls towards half the rate in some sensor, more than an AR1 does."""
     least = 0.4  # power at 0.48 over that at 0.24 of the rate: of an AR1 0.47
     middle, high = (data.power[int((data.ground.bands.frequency - f).abs().argmin())] for f in (0.24, 0.48))

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.detectors.spectra.power_differs import power_differs
 from gyrofuse.mismatch.likelihoods.spectra.components import Shift, Term
-from gyrofuse.mismatch.likelihoods.spectra.data import block_spectra, analog_noise
+from gyrofuse.mismatch.likelihoods.spectra.data import analog_noise, block_spectra
 from gyrofuse.mismatch.likelihoods.spectra.fit import pieces, powers
 from gyrofuse.mismatch.likelihoods.spectra.noise_parts import Parts
 from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios

@@ -14,7 +14,6 @@ from torch import Tensor
 from gyrofuse.mismatch.detectors.values.quantisation_grid import (
     Lattice,
     exact_lattices,
-    innovation_sd,
     missing_lattices,
     off_lattice,
 )
@@ -23,15 +22,16 @@ from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import OfSensors
+from gyrofuse.mismatch.signals.filters import filtered
 from gyrofuse.mismatch.signals.folds import estimation_samples, held_out_blocks
 from gyrofuse.mismatch.signals.lines import whitened
+from gyrofuse.mismatch.signals.records import Records
 from gyrofuse.mismatch.stats.limits import Z
 
 _TABLE = 1024  # points of a law
 _EVEN = 3.0  # steps, sd: over more of them all distances from the lattice are as likely
 _TAILS = 6.0  # sd
 _TOO_COARSE = 0.4  # rms change between samples, steps: of white noise that of 0.28 steps
-_UNDONE = 1.25  # sd of a sample given its past: a step's largest at which the rounded value can be estimated
 _STEEPEST, _FLAT = 8.0, 1e-4  # slopes of a logarithm of density over a step
 _RIDGE = 1e-3  # of correlations
 _SHARPEST = 0.02  # smallest blur, steps: it bounds the log likelihood ratio of an exact grid
@@ -81,7 +81,8 @@ class Quantization(Mechanism):
         """The case of a simulation that was rounded so: what is built in from now on comes before that.
 
         What was rounded may have been anywhere within half a step. There the noise's density, a normal one given all
-        other samples, is close to exponential, with the slope of its logarithm at the rounded value.
+        other samples, is close to exponential, with the slope of its logarithm at the rounded value. Where noise falls
+        below what rounding adds, as after a filter, that is white still: it is taken off.
         """
         side = comparison.reference
         white = whitened(side.noise, comparison.base)
@@ -96,7 +97,15 @@ class Quantization(Mechanism):
         again: Callable[[Tensor], Tensor] = partial(self.apply, info=comparison.info, generator=generator)
         converter = (*comparison.converter, (self.stage, again))
         analog = side.signal + self.step[:, None] * within
+        analog = filtered(analog, partial(self._without_rounding, side, replace(side, signal=analog)))
         return self._known_of_both(replace(comparison, analog=analog, converter=converter))
+
+    def _without_rounding(self, side: Records, analog: Records, f: Tensor) -> Tensor:
+        """Factors `(sensor, frequency)` that make of analogue records what the spectra of the rounded ones say."""
+        f, least = f.clamp(min=0.5 / side.signal.shape[-1]), 1e-3
+        density = side.density(f)
+        true = (density - self.step[:, None].square() / 12).maximum(least * density)
+        return (true / analog.density(f)).sqrt().clamp(max=1.0)
 
     def in_unit(self, factor: float) -> Quantization:
         """The same of numbers that are a factor larger."""
@@ -251,13 +260,13 @@ class Quantization(Mechanism):
 
 
 def _undone(comparison: Comparison) -> set[int]:
-    """Sensors whose exact grid in the simulation is fine enough to be undone."""
-    side = comparison.reference
-    return {
-        i
-        for i, (own, sd) in enumerate(zip(exact_lattices(side), innovation_sd(side), strict=True))
-        if own is not None and own.step < _UNDONE * float(sd)
-    }
+    """Sensors whose exact grid in the simulation is fine enough to be undone: what rounding adds is white."""
+    side, least_change, least_spread = comparison.reference, 0.57, 0.5  # steps, rms from sample to sample, and at all
+    change = side.signal.diff().square().mean((0, -1)).sqrt()
+    spread = side.signal.var(-1).mean(0).sqrt()
+    coarsest = torch.minimum(change / least_change, spread / least_spread)
+    lattices = exact_lattices(side)
+    return {i for i, own in enumerate(lattices) if own is not None and own.step < float(coarsest[i])}
 
 
 def _log_density(signal: Tensor, step: Tensor, offset: Tensor, blur: Tensor) -> Tensor:
