@@ -195,8 +195,7 @@ def _shapes(data: Ratios, n_samples: int) -> Shapes:
     relative = mean_of(torch.cat(added))[:, None] / ground.whole  # (shape, sensor, band)
     corners = torch.tensor([0.01, 0.04, 0.12, 0.35], dtype=torch.float64)
     passed = filter_power("sampled", filter_strength("sampled", corners), f)
-    rounding = 0.0 if ground.rounding is None else ground.rounding
-    filtered = mean_of(ground.density * passed[:, None]) / ground.mean * (1 - rounding) + rounding
+    filtered = (ground.whole - ground.mean + mean_of(ground.density * passed[:, None])) / ground.whole
     information = (data.information[:, None] * data.usable).mT
 
     def unit(weak: Tensor) -> Tensor:

@@ -34,6 +34,7 @@ from gyrofuse.mismatch.signals.psd import (
     cross_spectra,
     degrees_of_freedom,
     light_taper,
+    narrow_bands,
     taper_window,
 )
 from gyrofuse.mismatch.signals.records import Records
@@ -157,13 +158,13 @@ def analog_noise(comparison: Comparison) -> NoiseSpectrum:
 
 def _ground(comparison: Comparison) -> Ground:
     """The simulation's noise before the converter, and what that adds."""
-    bands, rounding, most = block_spectra(comparison).bands, comparison.rounding, 0.999
-    if rounding is not None and bool(rounding.any()):
-        whole = bands.mean_of(comparison.reference.density(bands.nodes))
-        rounding = (rounding[:, None] / whole).clamp(max=most)
-    else:
-        rounding = None
-    return Ground(analog_noise(comparison), bands, rounding)
+    bands = block_spectra(comparison).bands
+    # Slower than the narrow bands that show what simple spectra lack, that of the slow ordinates.
+    slow = bands.nodes < float(narrow_bands(comparison.n_samples).frequency[0])
+    shown = torch.where(
+        slow, reference_noise(comparison).spectrum(bands.nodes), comparison.reference.density(bands.nodes)
+    )
+    return Ground(analog_noise(comparison), bands, shown, comparison.rounding)
 
 
 @derived

@@ -142,11 +142,14 @@ class Ground:
     Attributes:
         base: Spectrum of the noise, as it comes to the converter.
         bands: Where spectra are compared.
-        rounding: Share of the powers that the converters of both sides add at last, `(sensor, band)`; None without.
+        shown: Density of the noise as it left the converter, `(sensor, node)`, which may have stop bands and humps that
+            no simple spectrum has; None where it is that of the base.
+        rounding: Variance that the converters of both sides add at last, `(sensor,)`; None without.
     """
 
     base: NoiseSpectrum
     bands: Bands
+    shown: Tensor | None = None
     rounding: Tensor | None = None
 
     @cached_property
@@ -160,8 +163,13 @@ class Ground:
 
     @cached_property
     def density(self) -> Tensor:
-        """`(sensor, node)`."""
-        return self.parts.densities.sum(0)
+        """Before the converter, `(sensor, node)`."""
+        if self.shown is None:
+            return self.parts.densities.sum(0)
+        if self.rounding is None:
+            return self.shown
+        least = 1e-3
+        return (self.shown - self.rounding[:, None]).maximum(least * self.shown)
 
     @cached_property
     def mean(self) -> Tensor:
@@ -171,12 +179,15 @@ class Ground:
     @cached_property
     def whole(self) -> Tensor:
         """The same after the converter, `(sensor, band)`."""
-        return self.mean if self.rounding is None else self.mean / (1 - self.rounding)
+        return self.mean if self.rounding is None or self.shown is None else self.bands.mean_of(self.shown)
 
     @cached_property
     def rounded(self) -> tuple[Tensor | float, Tensor | float]:
         """Shares of a power that came to the converter, and that it added, `(band, sensor)`."""
-        return (1.0, 0.0) if self.rounding is None else (1 - self.rounding.mT, self.rounding.mT)
+        if self.rounding is None:
+            return 1.0, 0.0
+        share = (self.mean / self.whole).mT
+        return share, 1 - share
 
     @cached_property
     def matters(self) -> Tensor:
