@@ -65,9 +65,7 @@ def spectral_gains(
     block = comparison.n_samples // N_JUDGED
     f = torch.arange(block + 1, dtype=torch.float64) / (2 * block)
     f[0] = f[1] / 2  # nothing of a block's mean is in its other ordinates
-    # Humps that simple spectra lack are nothing to judge others beside. Where they lack a stop band they are off anywhere.
-    density, base, stopped = comparison.reference.density(f), comparison.base.spectrum(f), 0.3
-    noise = torch.where((density / base).amin(-1, keepdim=True) < stopped, density, density.minimum(base))
+    noise = comparison.reference.density(f)  # simple spectra have no stop bands, no zeros and no humps
     plain = torch.diag_embed(noise.mT).to(torch.complex128)
     simulated = plain if before is None else before(plain, f)
     last = last_in_chain(comparison, plain)

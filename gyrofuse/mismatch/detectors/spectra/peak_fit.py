@@ -20,6 +20,7 @@ from gyrofuse.mismatch.likelihoods.spectra.noise_parts import Ground
 from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
+from gyrofuse.mismatch.signals.records import Records
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,20 +86,25 @@ def oscillation_of(comparison: Comparison) -> Oscillation | None:
     return _closely(comparison, strongest_peak(comparison))
 
 
-def _closely(comparison: Comparison, stretch: Stretch) -> Oscillation | None:
+def bump_at(comparison: Comparison, side: Records, stretch: Stretch) -> Oscillation | None:
+    """The bump that a side itself has at a stretch, over its own simple spectrum and what sensors share beside it."""
+    return _closely(replace(comparison, observed=side, reference=side), stretch, beside=1.5 * stretch.width)
+
+
+def _closely(comparison: Comparison, stretch: Stretch, beside: float = 0.0) -> Oscillation | None:
     """Fitted in cells of a quarter of the stretch, in finer ones while its half width is less than a tenth of it."""
     times = 3
-    found = _in_cells(comparison, stretch)
+    found = _in_cells(comparison, stretch, beside)
     for _ in range(times):
         if found is None or found.width > stretch.width / 10:
             break
         stretch = stretch._replace(frequency=found.centre, width=stretch.width / 4)
-        found = _in_cells(comparison, stretch) or found
+        found = _in_cells(comparison, stretch, beside) or found
     return found
 
 
-def _in_cells(comparison: Comparison, stretch: Stretch) -> Oscillation | None:
-    data = ratios_around(comparison, stretch.frequency, stretch.width)
+def _in_cells(comparison: Comparison, stretch: Stretch, beside: float) -> Oscillation | None:
+    data = ratios_around(comparison, stretch.frequency, stretch.width, beside)
     if data is None:
         return None
     # Where a filter takes two fifths off, flanks are not alike: the whole spectrum has to decide.

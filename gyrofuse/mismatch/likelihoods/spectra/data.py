@@ -229,13 +229,14 @@ def ratios(
     return Ratios.of(ground, (matrices, d), (power, s), expected, usable, independent)
 
 
-def ratios_around(comparison: Comparison, frequency: float, width: float) -> Ratios | None:
+def ratios_around(comparison: Comparison, frequency: float, width: float, beside: float = 0.0) -> Ratios | None:
     """Cross-spectra of a recording over the reference's noise in narrow cells around a frequency; None without room.
 
     Args:
         comparison: Recording and reference.
         frequency: Middle, cycles per sample.
         width: Width of four cells, cycles per sample.
+        beside: How far away the simulation's coherence is looked up, likewise.
     """
     n, narrowest, most = comparison.n_samples, 5, 24  # bins of a cell, which tapers fill; cells on either side
     cell, centre = max(round(width * n / 4), narrowest), round(frequency * n)
@@ -246,7 +247,8 @@ def ratios_around(comparison: Comparison, frequency: float, width: float) -> Rat
     ends = torch.tensor(edges, dtype=torch.float64)
     dof = torch.full((2 * count,), degrees_of_freedom(cell), dtype=torch.float64)
     ground = Ground(comparison.base, Bands(n, edges, (ends[:-1] + ends[1:] - 1) / 2 / n, dof))
-    band = int((comparison.bands.frequency - frequency).abs().argmin())
+    away = frequency + (beside if frequency + beside < 0.48 else -beside)
+    band = int((comparison.bands.frequency - away).abs().argmin())
     coherence = smooth_coherence(comparison.reference.coherence, comparison.reference.dof)[band]
     matrices = cross_spectra(comparison.observed.steady, ground.bands).mean(0)
     known = ground.mean.mT, exact(dof)

@@ -7,21 +7,28 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
 import torch
+from scipy import stats
 from torch import Tensor
 
-from gyrofuse.mismatch.detectors.spectra.peaks import strongest_peak
+from gyrofuse.mismatch.decisions import NEW_TERM_NATS
+from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
+from gyrofuse.mismatch.detectors.spectra.peak_fit import Oscillation, bump_at
+from gyrofuse.mismatch.detectors.spectra.peaks import Stretch, strongest_peak
 from gyrofuse.mismatch.likelihoods.spectra.data import reference_noise, shared_ordinates
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
 from gyrofuse.mismatch.mechanisms.simulated.exchanged import exchanged
-from gyrofuse.mismatch.mechanisms.spectra.bumps.oscillation import Mode, OscillationOnTop
+from gyrofuse.mismatch.mechanisms.spectra.bumps.oscillation import Mode, OscillationOnTop, refitted_mode
 from gyrofuse.mismatch.mechanisms.spectra.bumps.resonance import Resonance
 from gyrofuse.mismatch.mechanisms.spectra.bumps.wandering_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
+from gyrofuse.mismatch.mechanisms.spectra.findings import spanned
 from gyrofuse.mismatch.mechanisms.spectra.spectral import Addition, Spectral
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.filters import mixed
 from gyrofuse.mismatch.signals.folds import spectral_gains
-from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum
+from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum, fit_base
+from gyrofuse.mismatch.signals.psd import narrow_bands
+from gyrofuse.mismatch.signals.records import Records
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -137,9 +144,10 @@ class SimulatedResonance(SimulatedBump):
 
 @dataclass(frozen=True, eq=False)
 class MovedResonance(SimulatedResonance):
-    """A mode that the simulation has at another frequency, or of another width.
+    """A mode that the simulation has with other numbers: at another frequency, wider, or of another size.
 
-    Either alone leads away: what the one has at its foot stands for a part of the other.
+    Each side's is measured by itself, over the noise that it stands on. What one has more than the other has another
+    shape than either.
 
     Attributes:
         recorded: The mode as the recording has it.
@@ -149,31 +157,47 @@ class MovedResonance(SimulatedResonance):
 
     @classmethod
     def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
-        found = SimulatedResonance.detect_and_fit(comparison, level)
-        if found is None:
+        if comparison.reference.uncertainty is not None:  # what it has too much of may be the error of its numbers
             return None
-        assert isinstance(found.effect, SimulatedResonance)
-        old = found.effect.added.mode
-        generator = comparison.generator()
-        there = Resonance.detect_and_fit(found.effect.repair(comparison, generator), level)
-        if there is None or not isinstance(there.effect, Resonance) or not set(there.sensors) & set(found.sensors):
+        hump, nearby, plain = _hump_of(comparison.reference), 1.5, 3 * NEW_TERM_NATS
+        if hump is None:
             return None
-        new, nearby = there.effect.mode, 1.5
+        old, new = (bump_at(comparison, side, hump) for side in (comparison.reference, comparison.observed))
+        if old is None or new is None or min(old.nats, new.nats) < plain:
+            return None
         if not 1 / nearby < new.centre / old.centre < nearby:
             return None
+        off, sd = _differences(old, new)
+        z = off / sd
+        p_value = float(stats.chi2.sf(float(z.square().sum()), len(z)))
+        if p_value > level:
+            return None
         rate, unit = comparison.info.rate, comparison.info.measure
+        sensors = tuple(range(comparison.n_sensors))
+        parameters = {}
+        for prefix, bump in (("simulated_", old), ("", new)):
+            (at, wide), (at_sd, wide_sd) = (math.log(bump.centre), math.log(bump.width)), bump.log_sd
+            parameters[f"{prefix}frequency"] = spanned(lambda x: rate * math.exp(x), at, at_sd, "Hz")
+            parameters[f"{prefix}width"] = spanned(lambda x: 2 * rate * math.exp(x), wide, wide_sd, "Hz")
+            for i in sensors:
+                size, size_sd = float(bump.variance[i]), float(bump.variance_sd[i])
+                parameters[f"{prefix}rms[{i}]"] = spanned(lambda x: math.sqrt(max(x, 0.0)), size, size_sd, unit)
         before, after = (
-            f"{mode.centre * rate:.4g} Hz (quality factor {mode.centre / mode.width / 2:.3g}, "
-            f"up to {size:.3g} {unit} rms)"
-            for mode, size in ((old, _rms(comparison.reference.steady, old)), (new, float(new.gain.abs().max())))
+            f"{bump.centre * rate:.4g} Hz (quality factor {bump.centre / bump.width / 2:.3g}, "
+            f"up to {float(bump.variance.max().sqrt()):.3g} {unit} rms)"
+            for bump in (old, new)
         )
-        return replace(
-            there,
-            effect=cls(found.effect.added, found.effect.own, replace(there.effect, company=())),
-            sentence=f"the simulation's resonance at {before} is at {after} in the recording, in "
-            f"{comparison.info.named(there.sensors, 'all sensors')}",
-            p_value=max(found.p_value, there.p_value),
-            gain=found.gain + there.gain,
+        recorded, simulated = (Resonance(_mode(bump)) for bump in (new, old))
+        own = _base_below(comparison.reference, simulated.mode)
+        # Flanks of a mode are not quite those of an AR2.
+        return cls(simulated, own, recorded, approximate=True).found(
+            f"the simulation's resonance at {before} is at {after} in the recording, in all sensors",
+            p_value,
+            sensors,
+            parameters,
+            levels=(level_of(new.centre),),
+            frequency_hz=new.centre * rate,
+            gain=float(z.square().sum()) / 2,
         )
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
@@ -182,16 +206,16 @@ class MovedResonance(SimulatedResonance):
     def spectra(self, matrices: Tensor, f: Tensor) -> Tensor:
         return self.recorded.spectra(super().spectra(matrices, f), f)
 
-    def _after(self, matrices: Tensor, f: Tensor) -> Tensor:
-        return self.recorded.spectra(super()._after(matrices, f), f)
-
-    def _before(self, matrices: Tensor, f: Tensor) -> Tensor:
-        return self.added.spectra(super()._after(matrices, f), f)
+    def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
+        return Spectral.held_out_scores(self, comparison, fold)
 
     def apply_to_reference(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
         built = super().apply_to_reference(comparison, generator)
         mode = self.recorded.mode
         return replace(built, modes=(*built.modes, (mode.centre, mode.width)))
+
+    def fit_without(self, comparison: Comparison, fold: int) -> Mechanism:
+        return replace(self, recorded=replace(self.recorded, mode=refitted_mode(comparison, fold, self.recorded.mode)))
 
     def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
         self.recorded.plot(comparison, ax, sensor=sensor, fitted=fitted)
@@ -264,12 +288,49 @@ def _over_flanks(signal: Tensor, mode: Mode) -> Tensor:
     return power[:, inside].mean(-1).log() - power[:, beside].mean(-1).log()
 
 
-def _rms(signal: Tensor, mode: Mode) -> float:
-    """Of the loudest sensor at a mode, by how much its power stands above the flanks."""
-    f, power, inside, beside = _near(signal, mode)
-    profile = mode.profile(f)
-    above = power[:, inside].mean(-1) - power[:, beside].mean(-1)
-    return math.sqrt(max(float(above.max() / (profile[inside].mean() - profile[beside].mean())), 0.0))
+def _hump_of(side: Records) -> Stretch | None:
+    """The plainest hump of the density that simple spectra lack; None where it has none.
+
+    By the logarithms within over those beside it, on both sides, in the mean of the sensors.
+    """
+    narrow, least, span = narrow_bands(side.bands.n_samples), 0.25, 3
+    above = side.ripple.mean(0)
+    best: tuple[float, Stretch | None] = (0.0, None)
+    for width in (1, 2, 4, 8, 16, 32):  # bands
+        if (span + 1) * width > len(above) / 2:
+            break
+        inside = above.unfold(0, width, 1).mean(-1)  # from each band on
+        middle, away = inside[span * width : -span * width], span * width
+        beside = torch.maximum(inside[: -2 * away], inside[2 * away :])
+        height = (middle - beside) * math.sqrt(width)
+        at = int(height.argmax())
+        if float(height[at]) > best[0] and float(middle[at] - beside[at]) > least:
+            lower, upper = narrow.edges[at + away], narrow.edges[at + away + width]
+            n = narrow.n_samples
+            best = float(height[at]), Stretch((lower + upper) / 2 / n, 2 * (upper - lower) / n, 0.0, ())
+    return best[1]
+
+
+def _base_below(side: Records, mode: Mode) -> NoiseSpectrum:
+    """The simple spectrum of the noise that a mode stands on."""
+    mostly = 0.5  # of a power
+    alone = side.bands.mean_of(mode.profile(side.bands.nodes)) * mode.gain.abs().square()[:, None]
+    beside = (alone < mostly * side.power).all(0)
+    return fit_base(torch.where(beside, side.power - alone, 0.0), side.bands, side.bands.n_samples, side.dof * beside)
+
+
+def _mode(bump: Oscillation) -> Mode:
+    gain = bump.variance.clamp(min=0).sqrt().to(torch.complex128) if bump.gain is None else bump.gain
+    return Mode(bump.centre, bump.width, gain, bump.gain is not None)
+
+
+def _differences(old: Oscillation, new: Oscillation) -> tuple[Tensor, Tensor]:
+    """Of the logarithms of centre and width, and of the sensors' variances, with their standard deviations."""
+    numbers, sds = [], []
+    for bump in (old, new):
+        numbers.append(torch.cat([torch.tensor([bump.centre, bump.width], dtype=torch.float64).log(), bump.variance]))
+        sds.append(torch.cat([torch.tensor(bump.log_sd, dtype=torch.float64), bump.variance_sd]))
+    return numbers[1] - numbers[0], (sds[0].square() + sds[1].square()).sqrt()
 
 
 def _near(signal: Tensor, mode: Mode) -> tuple[Tensor, Tensor, Tensor, Tensor]:
