@@ -59,6 +59,7 @@ from gyrofuse.mismatch.mechanisms.spectra.cross_talk import CrossTalk
 from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.spectra.high_pass import HighPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter
+from gyrofuse.mismatch.mechanisms.spectra.moved_low_pass import MovedLowPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.notch import NotchFilter
 from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
 from gyrofuse.mismatch.mechanisms.values.angle_quantization import AngleQuantization
@@ -445,6 +446,19 @@ def _(setting: Setting) -> Drawn:
     corner = setting.sizes(0.9 * highest, highest) / max(setting.size, 1.0)
     strength = torch.where(corner > 0, filter_strength(kind, corner.clamp(min=1) / RATE), 0.0)
     return Drawn(LowPassFilter(kind, strength), setting.of_each("corner", corner))
+
+
+@draws(MovedLowPassFilter)
+def _(setting: Setting) -> Drawn:
+    """Of a simulation whose sensors all have its filter."""
+    kind = ("bilinear", "bilinear2")[int(setting.even(0, 2))]
+    own = setting.even(22.0, 28.0)
+    corner = setting.sizes(1.06, 1.1).pow(min(setting.size, 3.0) * setting.sign()) * own
+    every = filter_strength(kind, torch.full((setting.n_sensors,), own / RATE, dtype=torch.float64))
+    strength = torch.where(setting.sizes(1.0, 1.0) > 0, filter_strength(kind, corner.clamp(min=1) / RATE), 0.0)
+    effect = MovedLowPassFilter(kind, strength, kind, float(every[0]))
+    truth = setting.of_each("corner", torch.where(strength > 0, corner, 0.0)) | {"simulated_corner": own}
+    return Drawn(effect, truth, simulated=LowPassFilter(kind, every))
 
 
 @draws(HighPassFilter)

@@ -63,6 +63,7 @@ from gyrofuse.mismatch.mechanisms.spectra.cross_talk import CrossTalk
 from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.spectra.high_pass import HighPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter
+from gyrofuse.mismatch.mechanisms.spectra.moved_low_pass import MovedLowPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.notch import NotchFilter
 from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
 from gyrofuse.mismatch.mechanisms.values.angle_quantization import AngleQuantization
@@ -191,6 +192,7 @@ EVERY = (
     ParameterShift(BASE, torch.tensor([[0.1, 0.0], [1 / 3, 0.0], [0.0, 0.0], [0.2, 0.1]], dtype=torch.float64)),
     LowPassFilter("pole", numbers(0.7, 0.0)),
     LowPassFilter("bilinear2", numbers(0.7, 0.0), undone=True),
+    MovedLowPassFilter("bilinear2", numbers(0.7, 0.0), "bilinear3", 1 / 3),
     HighPassFilter(numbers(0.03, 0.0), 40.0, "bilinear2"),
     NotchFilter(0.11, 1 / 3, numbers(0.7, 0.0)),
     NotchFilter(0.21, 0.6, numbers(0.0, 5.0), "bilinear4"),

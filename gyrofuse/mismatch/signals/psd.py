@@ -205,7 +205,9 @@ def median_powers(records: Tensor, wanted: Bands) -> tuple[Tensor, Tensor]:
         own = power[..., round(first * scale) : round(end * scale)].flatten(1)
         independent = own.shape[-1] * n / length / 2
         seen = independent >= 4
-        levels.append(own.median(-1).values / math.log(2) if seen else own.new_ones(len(power)))
+        # Of an odd number the middle one lies higher than the lower of two in the middle of an even one.
+        usual = math.log(2) * (1 + 1.2 / own.shape[-1] * (own.shape[-1] % 2))
+        levels.append(own.median(-1).values / usual if seen else own.new_ones(len(power)))
         chance.append(2.1 / independent if seen else math.inf)
     return torch.stack(levels, -1), torch.tensor(chance, dtype=torch.float64)
 

@@ -223,15 +223,13 @@ class Records:
         narrow = narrow_bands(self.bands.n_samples)
         power, chance = median_powers(self.steady, narrow)
         apart = (power.clamp(min=1e-300) / narrow.mean_of(self.base.spectrum(narrow.nodes)).clamp(min=1e-300)).log()
-        plain, beside = 4.0, 4  # times the variance of chance: of many bands some stand out; bands on either side
+        plain = 4.0  # times the variance of chance: of many bands some stand out
         known = chance.isfinite()
-        if not bool(known.any()):
+        if int(known.sum()) < 2:
             return torch.zeros_like(apart)
-        # What neighbours have alike is no chance of theirs.
-        edges = torch.nn.functional.pad(apart[:, known], (beside, beside), mode="replicate")
-        alike = torch.nn.functional.avg_pool1d(edges, 2 * beside + 1, 1)
-        alike = drawn_towards(alike, plain * chance[known] / (2 * beside + 1), 0.0)
-        ripple = drawn_towards(apart[:, known], plain * chance[known], alike)
+        chance = chance[known]
+        apart = apart[:, known] + chance / 2  # mean of a logarithm, which chance makes less
+        ripple = drawn_towards(apart, plain * chance, _smooth(apart, chance))
         # Where bands are too few to tell it goes on as in the next one: a high-pass has no floor below.
         place = torch.arange(len(known))
         return ripple[:, (place[:, None] - place[known]).abs().argmin(1)]
@@ -267,6 +265,30 @@ class Records:
             # Sums of their own: a difference of sums from the first band on would lose what a filter holds back.
             smooth.append(total[low:high].sum(0) / dof[low:high].sum())
         return torch.stack(smooth)
+
+
+def _smooth(values: Tensor, chance: Tensor) -> Tensor:
+    """Course of values `(sensor, band)`: local parabolas, where these are more than chance, of variance `(band,)`."""
+    beside, plain = min(8, (values.shape[-1] - 1) // 2), 2.0  # bands on either side; of the mean of squares
+    x = torch.arange(-beside, beside + 1, dtype=values.dtype)
+    design = torch.stack([torch.ones_like(x), x, x.square()], -1)[:, : min(beside, 2) + 1]
+    weights = torch.linalg.pinv(design)[0]
+
+    def pooled(rows: Tensor, weights: Tensor) -> Tensor:
+        # Beyond an end they go on as they came, turned about what they are there.
+        ends = [rows[:, :3].mean(-1, keepdim=True), rows[:, -3:].mean(-1, keepdim=True)]
+        before, after = (
+            2 * end - part
+            for end, part in zip(
+                ends, (rows[:, 1 : beside + 1].flip(-1), rows[:, -beside - 1 : -1].flip(-1)), strict=True
+            )
+        )
+        whole = torch.cat([before, rows, after], -1) if beside else rows
+        return torch.nn.functional.conv1d(whole[:, None], weights[None, None])[:, 0]
+
+    smooth = pooled(values, weights)
+    energy = pooled(smooth.square() / (chance * weights.square().sum()), torch.full_like(x, 1 / len(x)))
+    return smooth * (1 - plain / energy.clamp(min=1e-9)).clamp(min=0.0)
 
 
 def _alike(level: Tensor) -> Tensor:

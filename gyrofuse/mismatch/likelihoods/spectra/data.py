@@ -160,10 +160,8 @@ def _ground(comparison: Comparison) -> Ground:
     """The simulation's noise before the converter, and what that adds."""
     bands = block_spectra(comparison).bands
     # Slower than the narrow bands that show what simple spectra lack, that of the slow ordinates.
-    slow = bands.nodes < float(narrow_bands(comparison.n_samples).frequency[0])
-    shown = torch.where(
-        slow, reference_noise(comparison).spectrum(bands.nodes), comparison.reference.density(bands.nodes)
-    )
+    f, slow = bands.nodes, bands.nodes < float(narrow_bands(comparison.n_samples).frequency[0])
+    shown = torch.where(slow, reference_noise(comparison).spectrum(f), comparison.reference.density(f))
     return Ground(analog_noise(comparison), bands, shown, comparison.rounding)
 
 
@@ -232,6 +230,8 @@ def ratios(
 def ratios_around(comparison: Comparison, frequency: float, width: float, beside: float = 0.0) -> Ratios | None:
     """Cross-spectra of a recording over the reference's noise in narrow cells around a frequency; None without room.
 
+    Where coherences are looked up beside it, over the simple spectrum: without what the reference itself has there.
+
     Args:
         comparison: Recording and reference.
         frequency: Middle, cycles per sample.
@@ -246,7 +246,8 @@ def ratios_around(comparison: Comparison, frequency: float, width: float, beside
     edges = tuple(centre + cell * k for k in range(-count, count + 1))
     ends = torch.tensor(edges, dtype=torch.float64)
     dof = torch.full((2 * count,), degrees_of_freedom(cell), dtype=torch.float64)
-    ground = Ground(comparison.base, Bands(n, edges, (ends[:-1] + ends[1:] - 1) / 2 / n, dof))
+    cells = Bands(n, edges, (ends[:-1] + ends[1:] - 1) / 2 / n, dof)
+    ground = Ground(comparison.base, cells, None if beside else comparison.reference.density(cells.nodes))
     away = frequency + (beside if frequency + beside < 0.48 else -beside)
     band = int((comparison.bands.frequency - away).abs().argmin())
     coherence = smooth_coherence(comparison.reference.coherence, comparison.reference.dof)[band]

@@ -33,7 +33,6 @@ from gyrofuse.mismatch.signals.dims import OfSensors
 
 _KINDS = ("bilinear", "bilinear2", "bilinear3", "bilinear4", "sampled2")
 _MOST = 1e6  # of a ratio of powers: where the simulation lets less through, others leak
-_LEAST = 1e-100  # of a power
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +57,7 @@ class MovedLowPass(Term):
     def values(self, ground: Ground, local: Tensor, shared: Tensor) -> Tensor:
         own = filter_power(self.kind, strength_of(self.kind, local[..., 0, :]), ground.nodes)
         undone = filter_power(self.simulated_kind, strength_of(self.simulated_kind, shared[..., :1]), ground.nodes)
-        return torch.where(self.free[0, :, None], (own / undone.clamp(min=_LEAST)).clamp(max=_MOST), 1.0)
+        return torch.where(self.free[0, :, None], (own / undone.clamp(min=1e-100)).clamp(max=_MOST), 1.0)
 
     def turn(self, f: Tensor) -> Tensor:
         own = filter_response(self.kind, strength_of(self.kind, self.local[0]), f)
@@ -163,7 +162,7 @@ class MovedLowPassFilter(Filter):
     def response(self, f: Tensor) -> Tensor:
         own = filter_response(self.kind, self.strength, f)
         undone = filter_response(self.simulated_kind, torch.full_like(self.strength[:1], self.simulated_strength), f)
-        ratio = own * undone.conj() / undone.abs().square().clamp(min=_LEAST)
+        ratio = own * undone.conj() / undone.abs().square().clamp(min=1e-100)
         ratio = ratio / (ratio.abs() / math.sqrt(_MOST)).clamp(min=1.0)
         return torch.where(self.strength[:, None] > 0, ratio, 1.0)
 
@@ -193,7 +192,7 @@ def _starts(data: Ratios, company: Sequence[Term]) -> list[MovedLowPass]:
     for simulated in _KINDS:
         numbers = torch.linspace(LowPass.lower, LowPass.upper, 400, dtype=torch.float64)
         undone = filter_power(simulated, strength_of(simulated, numbers), ground.nodes)  # (start, node)
-        left = shown - ground.bands.mean_of(undone).clamp(min=_LEAST)[:, fast].log()
+        left = shown - ground.bands.mean_of(undone).clamp(min=1e-100)[:, fast].log()
         mean = (left * weight).sum(-1, keepdim=True) / weight.sum()
         likeliest = int(((left - mean).square() * weight).sum(-1).argmin())
         families += [

@@ -105,7 +105,7 @@ class Quantization(Mechanism):
         f, least = f.clamp(min=0.5 / side.signal.shape[-1]), 1e-3
         density = side.density(f)
         true = (density - self.step[:, None].square() / 12).maximum(least * density)
-        return (true / analog.density(f)).sqrt().clamp(max=1.0)
+        return (true / analog.density(f)).sqrt().clamp(max=1.2)
 
     def in_unit(self, factor: float) -> Quantization:
         """The same of numbers that are a factor larger."""
