@@ -200,11 +200,25 @@ class MovedResonance(SimulatedResonance):
             gain=float(z.square().sum()) / 2,
         )
 
+    @property
+    def _as_filter(self) -> bool:
+        """Whether a filter makes the one mode of the other, whose flanks keep their form; sources are exchanged."""
+        return not (self.added.mode.shared or self.recorded.mode.shared)
+
+    def mixing(self, f: Tensor) -> Tensor:
+        if not self._as_filter:
+            return super().mixing(f)
+        noise = torch.diag_embed(self.own.spectrum(f.clamp(min=1 / self.own.n_samples)).mT).to(torch.complex128)
+        new, old = (effect.spectra(noise, f).diagonal(dim1=-2, dim2=-1).real for effect in (self.recorded, self.added))
+        return torch.diag_embed((new / old).sqrt()).to(torch.complex128)
+
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
-        return self.recorded.apply(super().apply(signal, info, generator), info, generator)
+        made = super().apply(signal, info, generator)
+        return made if self._as_filter else self.recorded.apply(made, info, generator)
 
     def spectra(self, matrices: Tensor, f: Tensor) -> Tensor:
-        return self.recorded.spectra(super().spectra(matrices, f), f)
+        made = super().spectra(matrices, f)
+        return made if self._as_filter else self.recorded.spectra(made, f)
 
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
         return Spectral.held_out_scores(self, comparison, fold)
