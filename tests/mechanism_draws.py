@@ -453,7 +453,7 @@ def _(setting: Setting) -> Drawn:
     """Of a simulation whose sensors all have its filter."""
     kind = ("bilinear", "bilinear2")[int(setting.even(0, 2))]
     own = setting.even(22.0, 28.0)
-    corner = setting.sizes(1.06, 1.1).pow(min(setting.size, 3.0) * setting.sign()) * own
+    corner = setting.sizes(1.25, 1.35).pow(min(setting.size, 2.0) * setting.sign()) * own
     every = filter_strength(kind, torch.full((setting.n_sensors,), own / RATE, dtype=torch.float64))
     strength = torch.where(setting.sizes(1.0, 1.0) > 0, filter_strength(kind, corner.clamp(min=1) / RATE), 0.0)
     effect = MovedLowPassFilter(kind, strength, kind, float(every[0]))

@@ -204,20 +204,14 @@ def test_it_is_named_and_nothing_else_is(case: Case) -> None:
         assert abs(value - middle) < 1.7 * half, name  # of several limits of 95 %
 
 
-@pytest.mark.parametrize(("recorded", "said"), [(None, [40.0]), (70.0, [40.0, 70.0])])
-def test_a_filter_of_the_simulation_alone_is_told_as_such(recorded: float | None, said: list[float]) -> None:
-    """Or one of another corner than the recording's, of which the ratio of both is no filter."""
-
-    def filtered(x: np.ndarray, corner: float | None) -> np.ndarray:
-        sections = None if corner is None else signal.butter(2, corner, fs=RATE, output="sos")
-        return x[:, 200:] if sections is None else signal.sosfilt(sections, x)[:, 200:]
-
-    report = diagnosed(filtered(noise(1), recorded), filtered(noise(2), 40.0))
-    assert [f.mechanism for f in report.findings] == ["low_pass"] * len(said)
+def test_a_filter_of_the_simulation_alone_is_told_as_such() -> None:
+    design = signal.butter(2, 40.0, fs=RATE, output="sos")
+    report = diagnosed(noise(1)[:, 200:], signal.sosfilt(design, noise(2))[:, 200:])
+    (finding,) = report.findings
+    assert finding.mechanism == "low_pass"
     assert report.held_out.after < 2
-    assert "the simulation has a low-pass filter" in report.findings[0].sentence
-    for finding, corner in zip(report.findings, said, strict=True):
-        assert abs(finding.parameters["corner[0]"].value - corner) < 1
+    assert "the simulation has a low-pass filter" in finding.sentence
+    assert abs(finding.parameters["corner[0]"].value - 40.0) < 0.5
 
 
 def test_swapped_sensors_are_told_by_their_names() -> None:

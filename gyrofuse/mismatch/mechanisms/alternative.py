@@ -21,5 +21,5 @@ class Alternative(NamedTuple):
     sd: float
 
     def beats(self, gain: float) -> bool:
-        """Whether it scores higher than the finding's `gain`: beyond chance, and a 1000th to which forms are true."""
-        return self.gain > gain + max(_BETTER_SD * self.sd, abs(gain) / 1000)
+        """Whether it scores higher than the finding's `gain`: beyond chance, and a 300th to which forms are true."""
+        return self.gain > gain + max(_BETTER_SD * self.sd, abs(gain) / 300)

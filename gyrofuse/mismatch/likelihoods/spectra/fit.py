@@ -202,7 +202,6 @@ class Pieces(NamedTuple):
         factor: Factors on the noise, `(..., sensor, node)`.
         added: Densities added.
         filters: Factors on everything.
-        undone: Factors that the reference has on everything; None without.
         common: Cross-spectra of common sources over the reference's powers, `(band, sensor, sensor)`; None without.
         values: What each term does, in the order of the terms; of a common source its cross-spectra.
         turn: What filters turn everything by, complex of size one, `(band, sensor)`; None without such a filter. Steps
@@ -212,7 +211,6 @@ class Pieces(NamedTuple):
     factor: Tensor
     added: Tensor
     filters: Tensor
-    undone: Tensor | None = None
     common: Tensor | None = None
     values: tuple[Tensor, ...] = ()
     turn: Tensor | None = None
@@ -225,27 +223,23 @@ class Pieces(NamedTuple):
         if acts == "scale":
             return self._replace(factor=self.factor / divisor * values)
         factor = values / torch.as_tensor(divisor).clamp(min=1e-300)
-        if acts == "undo":
-            return self._replace(undone=factor if self.undone is None else self.undone * factor)
+        if acts == "undo":  # the noise is what the reference was before its filter
+            return self._replace(factor=self.factor / factor.clamp(min=1e-12))
         return self._replace(filters=self.filters * factor)
 
     def model(self, data: Ratios) -> Tensor:
         """Cross-spectra over the reference's powers, `(..., band, sensor, sensor)`."""
         ground, mean_of = data.ground, data.ground.bands.mean_of
-        size = (mean_of(self.factor * self.filters * ground.density) / self._own(ground)).clamp(min=0).sqrt().mT
+        size = (mean_of(self.factor * self.filters * ground.density) / ground.mean).clamp(min=0).sqrt().mT
         share, last = ground.rounded
-        extra = (mean_of(self.added * self.filters) / self._own(ground)).mT * share + last * (1 - size.square())
+        extra = (mean_of(self.added * self.filters) / ground.mean).mT * share + last * (1 - size.square())
         own = data.expected * (size[..., :, None] * size[..., None, :]) * self._turned() + torch.diag_embed(extra)
         return own if self.common is None else own + self.common * self.passed(ground)
 
     def passed(self, ground: Ground) -> Tensor:
         """Factors of filters on cross-spectra, `(..., band, sensor, sensor)`."""
-        gain = (ground.bands.mean_of(self.filters) * ground.mean / self._own(ground)).clamp(min=0).sqrt().mT
+        gain = ground.bands.mean_of(self.filters).clamp(min=0).sqrt().mT
         return gain[..., :, None] * gain[..., None, :] * self._turned()
-
-    def _own(self, ground: Ground) -> Tensor:
-        """The reference's powers before the converter, had it what is undone, `(..., sensor, band)`."""
-        return ground.mean if self.undone is None else ground.bands.mean_of(self.undone * ground.density)
 
     def _turned(self) -> Tensor | float:
         """Factors of size one on cross-spectra, `(band, sensor, sensor)`."""
@@ -255,11 +249,11 @@ class Pieces(NamedTuple):
         """Powers over the reference's, `(..., band, sensor)`."""
         ground, mean_of = data.ground, data.ground.bands.mean_of
         share, last = ground.rounded
-        own = (mean_of((self.factor * ground.density + self.added) * self.filters) / self._own(ground)).mT
+        own = (mean_of((self.factor * ground.density + self.added) * self.filters) / ground.mean).mT
         own = own * share + last
         if self.common is None:
             return own
-        return own + powers(self.common) * (mean_of(self.filters) * ground.mean / self._own(ground)).mT
+        return own + powers(self.common) * mean_of(self.filters).mT
 
 
 def pieces(data: Ratios, terms: Sequence[Term]) -> Pieces:

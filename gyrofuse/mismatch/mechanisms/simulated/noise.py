@@ -167,6 +167,9 @@ class MovedResonance(SimulatedResonance):
             return None
         if not 1 / nearby < new.centre / old.centre < nearby:
             return None
+        fewest = 20  # bins of a half width, from which on it is noise and no line that wanders another way each time
+        if min(old.width, new.width) * comparison.n_samples < fewest or not _alike_in_all(old, new):
+            return None
         off, sd = _differences(old, new)
         z = off / sd
         p_value = float(stats.chi2.sf(float(z.square().sum()), len(z)))
@@ -331,6 +334,17 @@ def _base_below(side: Records, mode: Mode) -> NoiseSpectrum:
     alone = side.bands.mean_of(mode.profile(side.bands.nodes)) * mode.gain.abs().square()[:, None]
     beside = (alone < mostly * side.power).all(0)
     return fit_base(torch.where(beside, side.power - alone, 0.0), side.bands, side.bands.n_samples, side.dof * beside)
+
+
+def _alike_in_all(old: Oscillation, new: Oscillation) -> bool:
+    """Whether the mode is larger or smaller by about one factor in all sensors: else what differs is theirs."""
+    if min(float(old.variance.min()), float(new.variance.min())) <= 0:
+        return False
+    rare, ratio = 1e-3, (new.variance / old.variance).log()
+    sd = ((new.variance_sd / new.variance).square() + (old.variance_sd / old.variance).square()).sqrt()
+    weight = 1 / sd.square()
+    off = (ratio - (ratio * weight).sum() / weight.sum()) / sd
+    return float(stats.chi2.sf(float(off.square().sum()), max(len(off) - 1, 1))) > rare
 
 
 def _mode(bump: Oscillation) -> Mode:

@@ -74,11 +74,11 @@ class MovedLowPass(Term):
         return replace(self, free=torch.ones_like(self.free), local=torch.where(self.free, self.local, there))
 
     def within(self) -> MovedLowPass:
-        return replace(
-            self,
-            local=self.local.clamp(min=self.lower, max=self.upper),
-            shared=self.shared.clamp(min=self.lower, max=self.upper),
-        )
+        """The simulation's filter is one that shows: without it that of the recording is a filter by itself."""
+        highest = torch.tensor([0.47], dtype=torch.float64)  # corner, cycles per sample
+        least = float(filter_number(self.simulated_kind, filter_strength(self.simulated_kind, highest)))
+        local = self.local.clamp(min=self.lower, max=self.upper)
+        return replace(self, local=local, shared=self.shared.clamp(min=self.lower, max=least))
 
 
 @dataclass(frozen=True, eq=False)

@@ -104,8 +104,13 @@ class Quantization(Mechanism):
         """Factors `(sensor, frequency)` that make of analogue records what the spectra of the rounded ones say."""
         f, least = f.clamp(min=0.5 / side.signal.shape[-1]), 1e-3
         density = side.density(f)
-        true = (density - self.step[:, None].square() / 12).maximum(least * density)
-        return (true / analog.density(f)).sqrt().clamp(max=1.2)
+        added, faint = (
+            self.step[:, None].square() / 12,
+            0.3,
+        )  # of the power, from which on what was estimated tells less
+        true = (density - added).maximum(least * density)
+        below = ((added > faint * density) & (f > 0.05)).any(-1, keepdim=True)
+        return torch.where(below, (true / analog.density(f)).sqrt().clamp(max=1.2), 1.0)
 
     def in_unit(self, factor: float) -> Quantization:
         """The same of numbers that are a factor larger."""
