@@ -40,8 +40,15 @@ class Spectral(Mechanism, SpectralTerms):
     approximate: bool = field(default=False, kw_only=True, metadata={"saved": False})
 
     def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
-        factor = partial(self.factor, reference_noise(comparison)) if fitted else None
-        pictures.ratio_of_spectra(ax, comparison, sensor, factor)
+        pictures.ratio_of_spectra(ax, comparison, sensor, partial(self._seen, comparison) if fitted else None)
+
+    def _seen(self, comparison: Comparison, f: Tensor) -> Tensor:
+        """Its factor `(sensor, frequency)` as it shows above what both sides are rounded by."""
+        made = self.factor(reference_noise(comparison), f)
+        if comparison.rounding is None:
+            return made
+        last = (comparison.rounding[:, None] / comparison.reference.density(f)).clamp(max=1.0)
+        return made * (1 - last) + last
 
     def factor(self, base: NoiseSpectrum, f: Tensor) -> Tensor:
         """What it makes of the powers of a simulation's noise, `(sensor, frequency)` at `f` cycles per sample."""
