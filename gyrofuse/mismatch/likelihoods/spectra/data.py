@@ -230,13 +230,11 @@ def ratios(
 def ratios_around(comparison: Comparison, frequency: float, width: float, beside: float = 0.0) -> Ratios | None:
     """Cross-spectra of a recording over the reference's noise in narrow cells around a frequency; None without room.
 
-    Where coherences are looked up beside it, over the simple spectrum: without what the reference itself has there.
-
     Args:
         comparison: Recording and reference.
         frequency: Middle, cycles per sample.
         width: Width of four cells, cycles per sample.
-        beside: How far away the simulation's coherence is looked up, likewise.
+        beside: How far away its coherence is looked up, where it is not to be what the simulation has there; likewise.
     """
     n, narrowest, most = comparison.n_samples, 5, 24  # bins of a cell, which tapers fill; cells on either side
     cell, centre = max(round(width * n / 4), narrowest), round(frequency * n)
@@ -247,7 +245,9 @@ def ratios_around(comparison: Comparison, frequency: float, width: float, beside
     ends = torch.tensor(edges, dtype=torch.float64)
     dof = torch.full((2 * count,), degrees_of_freedom(cell), dtype=torch.float64)
     cells = Bands(n, edges, (ends[:-1] + ends[1:] - 1) / 2 / n, dof)
-    ground = Ground(comparison.base, cells, None if beside else comparison.reference.density(cells.nodes))
+    faint = 0.03 * comparison.base.spectrum(cells.nodes)  # in a stop band what comes through is no bump
+    density = comparison.reference.density(cells.nodes).maximum(faint)
+    ground = Ground(comparison.base, cells, None if beside else density)
     away = frequency + (beside if frequency + beside < 0.48 else -beside)
     band = int((comparison.bands.frequency - away).abs().argmin())
     coherence = smooth_coherence(comparison.reference.coherence, comparison.reference.dof)[band]

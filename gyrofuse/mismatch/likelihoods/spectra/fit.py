@@ -222,10 +222,10 @@ class Pieces(NamedTuple):
         divisor = 1.0 if instead is None else instead
         if acts == "scale":
             return self._replace(factor=self.factor / divisor * values)
-        factor = values / torch.as_tensor(divisor).clamp(min=1e-300)
         if acts == "undo":  # the noise is what the reference was before its filter
-            return self._replace(factor=self.factor / factor.clamp(min=1e-12))
-        return self._replace(filters=self.filters * factor)
+            least = 1e-9
+            return self._replace(factor=self.factor * ((torch.as_tensor(divisor) + least) / (values + least)))
+        return self._replace(filters=self.filters * (values / torch.as_tensor(divisor).clamp(min=1e-300)))
 
     def model(self, data: Ratios) -> Tensor:
         """Cross-spectra over the reference's powers, `(..., band, sensor, sensor)`."""

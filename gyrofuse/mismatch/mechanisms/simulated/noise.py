@@ -171,7 +171,8 @@ class MovedResonance(SimulatedResonance):
         if min(old.width, new.width) * comparison.n_samples < fewest or not _alike_in_all(old, new):
             return None
         off, sd = _differences(old, new)
-        z = off / sd
+        spread = 1.5  # of squares: what each side's simple spectrum is off beneath a broad mode is no part of the sds
+        z = off / (sd * math.sqrt(spread))
         p_value = float(stats.chi2.sf(float(z.square().sum()), len(z)))
         if p_value > level:
             return None
