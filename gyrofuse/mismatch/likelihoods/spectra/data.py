@@ -245,8 +245,8 @@ def ratios_around(comparison: Comparison, frequency: float, width: float, beside
     ends = torch.tensor(edges, dtype=torch.float64)
     dof = torch.full((2 * count,), degrees_of_freedom(cell), dtype=torch.float64)
     cells = Bands(n, edges, (ends[:-1] + ends[1:] - 1) / 2 / n, dof)
-    faint = 0.03 * comparison.base.spectrum(cells.nodes)  # in a stop band what comes through is no bump
-    density = comparison.reference.density(cells.nodes).maximum(faint)
+    # In a stop band what comes through is no bump.
+    density = comparison.reference.density(cells.nodes).maximum(comparison.base.spectrum(cells.nodes))
     ground = Ground(comparison.base, cells, None if beside else density)
     away = frequency + (beside if frequency + beside < 0.48 else -beside)
     band = int((comparison.bands.frequency - away).abs().argmin())
