@@ -51,9 +51,9 @@ def spectral_gains(
 
     The likelihood of cosine transforms, whose ordinates are independent for white noise and random walks. They are
     real: noise that sensors share a quarter of a cycle apart does not count. What rounds the values of both sides comes
-    last and stays as it is. Blocks are short: next to a filter's edge,
-    in its stop band and at its zeros most of an ordinate's power is what leaks in from elsewhere, so that spectra are
-    seen as a block shows them. Lines that the simulation has as well are no noise.
+    last and stays as it is. Blocks are short: next to a filter's edge, in its stop band and at its zeros most of an
+    ordinate's power is what leaks in from elsewhere, so that spectra are seen as a block shows them. Lines that the
+    simulation has as well are no noise.
 
     Args:
         comparison: Recording and simulation without the mechanism.
@@ -68,21 +68,23 @@ def spectral_gains(
     noise = comparison.reference.density(f)  # simple spectra have no stop bands, no zeros and no humps
     plain = torch.diag_embed(noise.mT).to(torch.complex128)
     simulated = plain if before is None else before(plain, f)
-    last = last_in_chain(comparison, plain)
-    made = spectra(plain - last, f) + last
+    made = before_converter(comparison, spectra, plain, f)
     after, without = (seen_in_block(matrices.real)[_FIRST:] for matrices in (made, simulated))
     came = comparison.observed.noise[0]
     own = came if left is comparison.recording else without_lines(left, comparison.observed.lines)
     return _log_scores(own, after, fold) - _log_scores(came, without, fold)
 
 
-def last_in_chain(comparison: Comparison, matrices: Tensor) -> Tensor:
-    """What rounding is of the simulation's cross-spectra `(frequency, sensor, sensor)`."""
+def before_converter(
+    comparison: Comparison, spectra: Callable[[Tensor, Tensor], Tensor], matrices: Tensor, f: Tensor
+) -> Tensor:
+    """What a mechanism makes of the simulation's cross-spectra `(frequency, sensor, sensor)`, rounding as it is."""
     if comparison.rounding is None:
-        return torch.zeros_like(matrices)
+        return spectra(matrices, f)
     most = 0.99  # of a power
     power = matrices.diagonal(dim1=-2, dim2=-1).real
-    return torch.diag_embed(comparison.rounding.minimum(most * power)).to(matrices.dtype)
+    last = torch.diag_embed(comparison.rounding.minimum(most * power)).to(matrices.dtype)
+    return spectra(matrices - last, f) + last
 
 
 def seen_in_block(spectra: Tensor) -> Tensor:

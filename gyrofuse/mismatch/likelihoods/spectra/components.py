@@ -29,7 +29,7 @@ class Term:
     """
 
     name: ClassVar[str]  # of the mechanism
-    acts: ClassVar[str] = "add"  # or "scale" the noise, "filter" everything
+    acts: ClassVar[str] = "add"  # or "scale" the noise, "filter" everything, "undo" the simulation's filter of it
     coherent: ClassVar[bool] = False  # whether sensors share it
     turns: ClassVar[bool] = False  # whether it moves phases
     lower: ClassVar[float] = -math.inf  # bounds of local numbers

@@ -11,7 +11,7 @@ from gyrofuse._base.transforms import cosine_ordinates
 from gyrofuse.mismatch.likelihoods.spectra.data import reference_noise
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
-from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED, last_in_chain
+from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED, before_converter
 from gyrofuse.mismatch.signals.records import Records
 
 N_SLOW = 3 * N_JUDGED - 1  # cosine ordinates of a record below the third of a block, the first that is judged there
@@ -39,8 +39,7 @@ def slow_gains(comparison: Comparison, spectra: Callable[[Tensor, Tensor], Tenso
     y = slow_ordinates(comparison.observed)[0, :, k - 1].mT  # (ordinate, sensor)
     f = k.to(y.dtype) / (2 * comparison.n_samples)
     plain = torch.diag_embed(reference_noise(comparison).spectrum(f).mT).to(torch.complex128)
-    last = last_in_chain(comparison, plain)
-    gain = _log_score(y, (spectra(plain - last, f) + last).real) - _log_score(y, plain.real)
+    gain = _log_score(y, before_converter(comparison, spectra, plain, f).real) - _log_score(y, plain.real)
     return gains.index_add(0, torch.arange(len(k)) % len(gains), gain)
 
 

@@ -26,7 +26,7 @@ from gyrofuse.mismatch.likelihoods.spectra.starts import closest_starts
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
 from gyrofuse.mismatch.mechanisms.spectra.findings import found, half_power_words, spanned
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import chosen_shape, refit
-from gyrofuse.mismatch.mechanisms.spectra.low_pass import falls
+from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter, falls
 from gyrofuse.mismatch.mechanisms.spectra.spectral import Filter
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.dims import OfSensors
@@ -96,8 +96,8 @@ class MovedLowPassFilter(Filter):
     """
 
     name: ClassVar[str] = "low_pass"
-    rivals: ClassVar[tuple[str, ...]] = ("parameter_shift", "flicker", "common_mode")
-    separated_by: ClassVar[str] = "a higher sampling rate, or the response to a known motion"
+    rivals: ClassVar[tuple[str, ...]] = LowPassFilter.rivals
+    separated_by: ClassVar[str] = LowPassFilter.separated_by
     made_of: ClassVar[str] = "filter"
     kind: str
     strength: OfSensors

@@ -104,10 +104,8 @@ class Quantization(Mechanism):
         """Factors `(sensor, frequency)` that make of analogue records what the spectra of the rounded ones say."""
         f, least = f.clamp(min=0.5 / side.signal.shape[-1]), 1e-3
         density = side.density(f)
-        added, faint = (
-            self.step[:, None].square() / 12,
-            0.3,
-        )  # of the power, from which on what was estimated tells less
+        added = self.step[:, None].square() / 12
+        faint = 0.3  # of the power, from which on what was estimated tells less
         true = (density - added).maximum(least * density)
         below = ((added > faint * density) & (f > 0.05)).any(-1, keepdim=True)
         return torch.where(below, (true / analog.density(f)).sqrt().clamp(max=1.2), 1.0)
