@@ -245,9 +245,9 @@ def ratios_around(comparison: Comparison, frequency: float, width: float, beside
     ends = torch.tensor(edges, dtype=torch.float64)
     dof = torch.full((2 * count,), degrees_of_freedom(cell), dtype=torch.float64)
     cells = Bands(n, edges, (ends[:-1] + ends[1:] - 1) / 2 / n, dof)
-    # In a stop band what comes through is no bump.
-    density = comparison.reference.density(cells.nodes).maximum(comparison.base.spectrum(cells.nodes))
-    ground = Ground(comparison.base, cells, None if beside else density)
+    # Where a filter of another form was built in, what comes through its stop band is no bump.
+    simple = beside or comparison.bent
+    ground = Ground(comparison.base, cells, None if simple else comparison.reference.density(cells.nodes))
     away = frequency + (beside if frequency + beside < 0.48 else -beside)
     band = int((comparison.bands.frequency - away).abs().argmin())
     coherence = smooth_coherence(comparison.reference.coherence, comparison.reference.dof)[band]
