@@ -203,12 +203,16 @@ def median_powers(records: Tensor, wanted: Bands) -> tuple[Tensor, Tensor]:
     scale, levels, chance = length / wanted.n_samples, [], []
     for first, end in itertools.pairwise(wanted.edges):
         own = power[..., round(first * scale) : round(end * scale)].flatten(1)
-        independent = own.shape[-1] * n / length / 2
-        seen = independent >= 4
+        count = own.shape[-1]
+        independent = count * n / length / 2
+        if independent < 4:
+            levels.append(own.new_ones(len(power)))
+            chance.append(math.inf)
+            continue
         # Of an odd number the middle one lies higher than the lower of two in the middle of an even one.
-        usual = math.log(2) * (1 + 1.2 / own.shape[-1] * (own.shape[-1] % 2))
-        levels.append(own.median(-1).values / usual if seen else own.new_ones(len(power)))
-        chance.append(2.1 / independent if seen else math.inf)
+        usual = math.log(2) * (1 + 1.2 / count * (count % 2))
+        levels.append(own.median(-1).values / usual)
+        chance.append(2.1 / independent)
     return torch.stack(levels, -1), torch.tensor(chance, dtype=torch.float64)
 
 
