@@ -37,6 +37,7 @@ from gyrofuse.mismatch.mechanisms.signals.sensor_delay import SensorDelay
 from gyrofuse.mismatch.mechanisms.signals.time_scale import TimeScale
 from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
 from gyrofuse.mismatch.mechanisms.signals.tone_amplitude import ToneSize
+from gyrofuse.mismatch.mechanisms.simulated.course import SimulatedCourse, SimulatedRamp, SimulatedStep, SimulatedWarmUp
 from gyrofuse.mismatch.mechanisms.simulated.noise import (
     MovedResonance,
     SimulatedCommonMode,
@@ -47,6 +48,7 @@ from gyrofuse.mismatch.mechanisms.simulated.spikes import SimulatedSpikes
 from gyrofuse.mismatch.mechanisms.slow.bias_oscillation import BiasOscillation
 from gyrofuse.mismatch.mechanisms.slow.late_warm_up import LateWarmUp
 from gyrofuse.mismatch.mechanisms.slow.ramp import Ramp
+from gyrofuse.mismatch.mechanisms.slow.slow_effect import SlowEffect
 from gyrofuse.mismatch.mechanisms.slow.step import Step
 from gyrofuse.mismatch.mechanisms.slow.temperature import TemperatureDrift
 from gyrofuse.mismatch.mechanisms.slow.warm_up import Decay, WarmUpTransient
@@ -373,13 +375,13 @@ def _(setting: Setting) -> Drawn:
 
 
 @draws(Step)
-def _(setting: Setting) -> Drawn:
+def _step(setting: Setting) -> Drawn:
     size, onset = setting.signed(2.5, 3.5) * setting.size, int(setting.even(0.3, 0.7) * setting.n_samples) / RATE
     return Drawn(Step(size, _none(setting), onset), {"onset": onset, **setting.of_each("size", size)})
 
 
 @draws(Ramp)
-def _(setting: Setting) -> Drawn:
+def _ramp(setting: Setting) -> Drawn:
     onset = int(setting.even(0.2, 0.5) * setting.n_samples) / RATE
     slope = setting.signed(6.0, 8.0) * setting.size / (setting.n_samples / RATE - onset)
     return Drawn(Ramp(slope, _none(setting), onset), {"onset": onset, **setting.of_each("slope", slope)})
@@ -394,7 +396,7 @@ def _(setting: Setting) -> Drawn:
 
 
 @draws(WarmUpTransient)
-def _(setting: Setting) -> Drawn:
+def _warm_up(setting: Setting) -> Drawn:
     size, tau = setting.signed(5.0, 7.0) * setting.size, setting.even(0.05, 0.2) * setting.n_samples / RATE
     slower = (Decay(setting.signed(5.0, 7.0), 3 * tau),) if setting.size > 1 else ()
     effect = WarmUpTransient(size, _none(setting), tau, slower)
@@ -546,6 +548,26 @@ def _(setting: Setting) -> Drawn:
     drawn = _spikes(setting, 0.005, 0.01)  # each that is missing says a nat
     assert isinstance(drawn.effect, Spikes)
     return Drawn(SimulatedSpikes(drawn.effect), drawn.truth, simulated=drawn.effect)
+
+
+@draws(SimulatedStep)
+def _(setting: Setting) -> Drawn:
+    return _of_simulation(SimulatedStep, _step(setting))
+
+
+@draws(SimulatedRamp)
+def _(setting: Setting) -> Drawn:
+    return _of_simulation(SimulatedRamp, _ramp(setting))
+
+
+@draws(SimulatedWarmUp)
+def _(setting: Setting) -> Drawn:
+    return _of_simulation(SimulatedWarmUp, _warm_up(setting))
+
+
+def _of_simulation(kind: type[SimulatedCourse], drawn: Drawn) -> Drawn:
+    assert isinstance(drawn.effect, SlowEffect)
+    return drawn._replace(effect=kind(drawn.effect), simulated=drawn.effect)
 
 
 @draws(SimulatedResonance)

@@ -16,6 +16,7 @@ import gyrofuse as gf
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.mechanisms.signals.clock import ClockSkew
 from gyrofuse.mismatch.mechanisms.signals.sensor_delay import SensorDelay
+from gyrofuse.mismatch.mechanisms.simulated.course import SimulatedCourse
 from gyrofuse.mismatch.repair.inputs import prepared
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum
@@ -183,14 +184,15 @@ def concealed(kind: type[Mechanism], *seed: object, n_sensors: int = 2) -> tuple
     concerned, n_sensors = ((0,), max(n_sensors, 3)) if apart else (None, n_sensors)
     drawn, setting = drawn_in(kind, *seed, n_sensors=n_sensors, concerned=concerned)
     rng = setting.generator
-    simulation = array(n_sensors).simulate(RECORDS * N_SAMPLES, generator=rng)
+    n_simulated = N_SAMPLES if issubclass(kind, SimulatedCourse) else RECORDS * N_SAMPLES  # one record has a course
+    simulation = array(n_sensors).simulate(n_simulated, generator=rng)
     recording = setting.clean
     for f in drawn.tones:
         recording = recording + tone(n_sensors, N_SAMPLES, setting.even(0, 6), f)
-        simulation = simulation + tone(n_sensors, RECORDS * N_SAMPLES, setting.even(0, 6), f)
+        simulation = simulation + tone(n_sensors, n_simulated, setting.even(0, 6), f)
     if drawn.moved:
         recording = recording + motion(N_SAMPLES, rng)
-        simulation = simulation + motion(RECORDS * N_SAMPLES, rng)
+        simulation = simulation + motion(n_simulated, rng)
     where = info(n_sensors, drawn.channels)
     if drawn.simulated is not None:
         recording, simulation = (drawn.simulated.apply(side, where, rng) for side in (recording, simulation))

@@ -167,8 +167,12 @@ def diagnose(
         unexplained = [much]
     if judge is not None:
         progress("another recording", _COMPARED)
+    of_samples = [effect for effect in effects if effect.of_samples]
+    if of_samples:
+        bare = _unrounded(repaired(start, of_samples, generator))
+        model = replace(model, noise=noise_of(simulation, bare))
     return report(
-        replace(model, effects=(*own, *effects)),
+        replace(model, effects=(*own, *(effect for effect in effects if not effect.of_samples))),
         mismatch=True,
         findings=findings,
         unexplained=tuple(unexplained),

@@ -1,4 +1,4 @@
-"""What the simulation has as well, with other numbers: filters, resonances, and the rounding that comes after both."""
+"""What the simulation has with other numbers, or alone: filters, resonances, rounding after both, courses of a bias."""
 
 from __future__ import annotations
 
@@ -131,3 +131,20 @@ def test_the_density_of_noise_with_a_stop_band_is_its_own() -> None:
     f = torch.linspace(0.05, 0.45, 400, dtype=torch.float64)
     true = 0.01 * np.abs(signal.freqz(*signal.butter(2, 50.0, fs=RATE), worN=2 * np.pi * f.numpy())[1]) ** 2
     assert np.abs(np.log(side.density(f).numpy() / true)).mean() < 0.1
+
+
+@pytest.mark.parametrize(("name", "size"), [("step", 0.8), ("warm_up_transient", 1.5)])
+def test_a_course_of_the_simulation_alone_is_told_and_leaves_its_noise_model(name: str, size: float) -> None:
+    t = np.arange(N) / RATE
+    course = np.where(t > 50, size, 0.0) if name == "step" else size * np.exp(-t / 12)
+    simulation = noise(22)
+    simulation[:2] += course
+    report = diagnosed(noise(21), simulation)
+    (finding,) = report.findings
+    assert (finding.mechanism, finding.sensors) == (name, (0, 1))
+    assert finding.sentence.startswith("only in the simulation the bias of sensors 1, 2")
+    assert all(holds(finding, f"size[{i}]", size, 0.05) for i in (0, 1))
+    assert not report.unexplained
+    drawn = report.model.simulate(N, generator=torch.Generator().manual_seed(1))
+    ends = drawn[:, -2000:].mean(-1) - drawn[:, :2000].mean(-1)
+    assert float(ends.abs().max()) < 0.7 * size

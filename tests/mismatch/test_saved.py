@@ -41,6 +41,7 @@ from gyrofuse.mismatch.mechanisms.signals.sensor_delay import SensorDelay
 from gyrofuse.mismatch.mechanisms.signals.time_scale import TimeScale
 from gyrofuse.mismatch.mechanisms.signals.tone import Harmonic, VibrationTone
 from gyrofuse.mismatch.mechanisms.signals.tone_amplitude import ToneSize
+from gyrofuse.mismatch.mechanisms.simulated.course import SimulatedRamp, SimulatedStep, SimulatedWarmUp
 from gyrofuse.mismatch.mechanisms.simulated.noise import (
     MovedResonance,
     SimulatedCommonMode,
@@ -179,6 +180,9 @@ EVERY = (
         numbers(1 / 3, 0.0), torch.zeros(2, 4, dtype=torch.float64), 2.3, (Decay(numbers(0.2, 0.0), 20 / 3),)
     ),
     Step(numbers(0.0, 1 / 3), torch.zeros(2, 4, dtype=torch.float64), 3.3),
+    SimulatedStep(Step(numbers(0.0, 1 / 3), torch.zeros(2, 4, dtype=torch.float64), 3.3)),
+    SimulatedRamp(Ramp(numbers(0.0, 1 / 3), torch.zeros(2, 4, dtype=torch.float64), 3.3)),
+    SimulatedWarmUp(WarmUpTransient(numbers(0.0, 1 / 3), torch.zeros(2, 4, dtype=torch.float64), 3.3)),
     Ramp(numbers(0.0, 1 / 3), torch.zeros(2, 4, dtype=torch.float64), 3.3),
     Motion(
         numbers(1.5, 4.0),

@@ -13,6 +13,7 @@ from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.detectors.slow.channels import channel_test
 from gyrofuse.mismatch.detectors.slow.hysteresis import hysteresis_test
 from gyrofuse.mismatch.detectors.slow.scans import slow_test
+from gyrofuse.mismatch.detectors.slow.simulated_course import simulated_course_test
 from gyrofuse.mismatch.detectors.spectra.band_tests import coherence_test, line_test, spectrum_test
 from gyrofuse.mismatch.detectors.spectra.peaks import peak_test
 from gyrofuse.mismatch.detectors.spectra.pooled_coherence import common_source_test
@@ -37,6 +38,7 @@ TESTS: tuple[Callable[[Comparison], TestResult], ...] = (
     pulse_test,
     jump_test,
     slow_test,
+    simulated_course_test,
     hysteresis_test,
     variance_test,
     spectrum_test,

@@ -34,6 +34,7 @@ from gyrofuse.mismatch.mechanisms.signals.sensor_delay import SensorDelay
 from gyrofuse.mismatch.mechanisms.signals.time_scale import TimeScale
 from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
 from gyrofuse.mismatch.mechanisms.signals.tone_amplitude import ToneSize
+from gyrofuse.mismatch.mechanisms.simulated.course import SimulatedRamp, SimulatedStep, SimulatedWarmUp
 from gyrofuse.mismatch.mechanisms.simulated.noise import (
     MovedResonance,
     SimulatedCommonMode,
@@ -89,6 +90,7 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (RandomTelegraph,),
     (ChannelNoise, GradualChange),  # where noise is louder, what is slow is known less well
     (TemperatureDrift, WarmUpTransient, LateWarmUp, Ramp, Step, BiasOscillation),
+    (SimulatedWarmUp, SimulatedRamp, SimulatedStep),
     (VarianceChange,),  # to which large jumps look alike
     (SensorDelay,),  # to which sources and modes in common would be a makeshift
     (MovedResonance, SimulatedResonance, SimulatedWanderingTone, SimulatedCommonMode),  # plain in the simulation

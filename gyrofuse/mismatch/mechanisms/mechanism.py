@@ -60,6 +60,7 @@ class Mechanism:
         additive: Whether its repair takes it off the recording, instead of applying it to the simulation.
         known_path: Whether it adds a path that is known up to its amplitudes.
         happened_once: Whether it belongs to a time of this recording, and is not expected in another one.
+        of_samples: Whether it is taken off the simulation's samples, so that their noise is estimated without it.
         changes_noise: Whether it changes levels or spectra of noise, so that wrong numbers lead a simulation away.
         of_spectra: Whether it is found in spectra alone.
         broad: Whether its spectral width is that of noise, on which a spectral line may stand.
@@ -81,6 +82,7 @@ class Mechanism:
     additive: ClassVar[bool] = False
     known_path: ClassVar[bool] = False
     happened_once: ClassVar[bool] = False
+    of_samples: ClassVar[bool] = False
     changes_noise: ClassVar[bool] = False
     of_spectra: ClassVar[bool] = False
     broad: ClassVar[bool] = False

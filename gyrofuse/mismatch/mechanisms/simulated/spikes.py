@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, ClassVar
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.detectors.exchanged import exchanged
 from gyrofuse.mismatch.detectors.variance.outliers import fewer_outliers_p_value
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
 from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
-from gyrofuse.mismatch.mechanisms.simulated.exchanged import exchanged
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 
 if TYPE_CHECKING:
