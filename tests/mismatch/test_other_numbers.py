@@ -9,6 +9,7 @@ from scipy import signal
 
 import gyrofuse as gf
 from gyrofuse.mismatch import Finding, MismatchReport
+from gyrofuse.mismatch.detectors.values.truncation import is_cut_off, step_counts
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 
@@ -148,3 +149,44 @@ def test_a_course_of_the_simulation_alone_is_told_and_leaves_its_noise_model(nam
     drawn = report.model.simulate(N, generator=torch.Generator().manual_seed(1))
     ends = drawn[:, -2000:].mean(-1) - drawn[:, :2000].mean(-1)
     assert float(ends.abs().max()) < 0.7 * size
+
+
+def cut_off(seed: int, step: float) -> np.ndarray:
+    """Of a bias that hardly leaves zero, around which fractions are lost in another way than elsewhere."""
+    return step * np.trunc(steady_noise(seed) / step)
+
+
+def steady_noise(seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    walk = signal.lfilter([0.001], [1, -0.999], rng.standard_normal((3, N)))
+    return 0.1 * rng.standard_normal((3, N)) + walk
+
+
+@pytest.mark.parametrize("rounds", [False, True])
+def test_a_converter_that_drops_the_fraction_is_told_from_one_that_rounds(rounds: bool) -> None:
+    simulation = steady_noise(32)
+    report = diagnosed(cut_off(31, 0.12), rounded(simulation, 0.12) if rounds else simulation)
+    (finding,) = report.findings
+    assert isinstance(finding.effect, Quantization)
+    assert finding.effect.cut_off == (True, True, True)
+    assert "cut off towards zero in all of them" in finding.sentence
+    assert not report.unexplained
+    assert report.held_out.after < 1.5
+
+
+def test_simulations_that_drop_the_fraction_as_the_recording_does_agree() -> None:
+    assert not diagnosed(cut_off(33, 0.12), cut_off(34, 0.12)).mismatch
+
+
+@pytest.mark.parametrize(("seed", "share", "wanted"), [(1, 0.0, True), (2, 0.1, None), (3, 0.5, None)])
+def test_zeros_in_the_place_of_lost_values_are_no_fractions_cut_off(
+    seed: int, share: float, wanted: bool | None
+) -> None:
+    rng = np.random.default_rng(seed)
+    values = 1.5 * rng.standard_normal(20_000) + 0.4
+    values = np.trunc(values) if share == 0 else np.where(rng.random(20_000) < share, 0.0, np.round(values))
+    unique, counts = torch.unique(torch.from_numpy(values), return_counts=True)
+    assert is_cut_off(step_counts(unique, counts, 1.0)) is wanted
+    values = np.round(1.5 * rng.standard_normal(20_000) + 0.4)
+    unique, counts = torch.unique(torch.from_numpy(values), return_counts=True)
+    assert is_cut_off(step_counts(unique, counts, 1.0)) is False

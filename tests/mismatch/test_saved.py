@@ -104,6 +104,7 @@ EVERY = (
     SensorGain(numbers(-1 / 3, 1.0)),
     Quantization(numbers(0.3, 0.0), numbers(0.01, 0.0), numbers(0.2, 0.0), numbers(1 / 3, 0.1)),
     Quantization(numbers(0.3, 0.0), numbers(0.01, 0.0), numbers(0.0, 0.0), numbers(1 / 3, 0.1), (0.0, 1 / 3)),
+    Quantization(numbers(0.3, 0.1), numbers(0.0, 0.0), numbers(0.0, 0.0), numbers(1 / 3, 0.1), (), (True, False)),
     Clipping(numbers(-0.7, -math.inf), numbers(math.inf, 1 / 3), numbers(0.1, 0.2)),
     StuckSamples(numbers(0.2, 0.1), numbers(0.01, 0.0), True),
     HeldValues(numbers(2.5, 1.0), numbers(0.3, 0.0), numbers(0.01, 0.0)),

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from gyrofuse._base.transforms import squared_modulus
 from gyrofuse.mismatch.decisions import CERTAIN, CHANCE
+from gyrofuse.mismatch.detectors.values.truncation import is_cut_off, step_counts
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.prediction_errors import left_out
@@ -44,6 +45,7 @@ class Lattice(NamedTuple):
         p_value: p value of continuous values, over every step.
         peak: Frequency of the peak of the characteristic function, 0 where the grid is exact. Below `2 pi/step` if the
             values spread over few steps, since what blurs the grid damps high frequencies more.
+        cut_off: Whether values are cut off towards zero, and not rounded; None where that cannot be told.
     """
 
     step: float
@@ -51,6 +53,12 @@ class Lattice(NamedTuple):
     blur: float
     p_value: float
     peak: float = 0.0
+    cut_off: bool | None = None
+
+    @property
+    def has_zero(self) -> bool:
+        """Whether zero is one of its points."""
+        return abs(self.offset) < 0.01 * self.step
 
     @classmethod
     def none(cls) -> Lattice:
@@ -106,10 +114,17 @@ def distinct_values(side: Records) -> tuple[tuple[Tensor, Tensor], ...]:
 
 @derived
 def exact_lattices(side: Records) -> tuple[Lattice | None, ...]:
-    """The exact grid of each sensor's values in the first record, `None` without."""
-    return tuple(
-        _exact_lattice(*v, float(sd)) for v, sd in zip(distinct_values(side), innovation_sd(side), strict=True)
-    )
+    """The exact grid of each sensor's values in the first record, `None` without.
+
+    Sensors of one step have one kind of converter: what is told of one of them holds for those of which it is not.
+    """
+    found = [_exact_lattice(*v, float(sd)) for v, sd in zip(distinct_values(side), innovation_sd(side), strict=True)]
+    told = [own for own in found if own is not None and own.cut_off is not None]
+    for i, own in enumerate(found):
+        if own is not None and own.cut_off is None and own.has_zero:
+            alike = {other.cut_off for other in told if abs(other.step / own.step - 1) < 1e-3}
+            found[i] = own._replace(cut_off=alike.pop()) if len(alike) == 1 else own
+    return tuple(found)
 
 
 def _exact_lattice(unique: Tensor, counts: Tensor, sd: float) -> Lattice | None:
@@ -127,7 +142,10 @@ def _exact_lattice(unique: Tensor, counts: Tensor, sd: float) -> Lattice | None:
         step = float((counts * (k - middle) * (unique - mean)).sum() / (counts * (k - middle).square()).sum())
         off = (unique - mean) / step - (k - middle)
         if float(counts[off.abs() < 0.01].sum() / counts.sum()) >= 0.999:
-            return Lattice(step, math.remainder(float(mean - middle * step), step), 0.0, 0.0)
+            offset = math.remainder(float(mean - middle * step), step)
+            found = Lattice(step, offset, 0.0, 0.0)
+            told = found.has_zero and step < 3 * sd  # coarser ones are met by a bias that stays there
+            return found._replace(cut_off=is_cut_off(step_counts(unique, counts, step))) if told else found
     return None
 
 
@@ -270,7 +288,7 @@ def missing_lattices(comparison: Comparison, level: float) -> Missing:
     coarser = {
         i: other
         for i, other in enumerate(reference)
-        if other is not None and _too_coarse(comparison, i, observed[i], other)
+        if other is not None and (_too_coarse(comparison, i, observed[i], other) or _cut_otherwise(observed[i], other))
     }
     missing = {
         i: own
@@ -287,6 +305,11 @@ def missing_lattices(comparison: Comparison, level: float) -> Missing:
         missing |= here
         hidden = [i for i in hidden if i not in here]
     return Missing(p_value, dict(sorted(missing.items())), coarser)
+
+
+def _cut_otherwise(own: Lattice | None, other: Lattice) -> bool:
+    """Whether values of one step are cut off towards zero in one of them, and rounded in the other."""
+    return own is not None and {own.cut_off, other.cut_off} == {True, False} and abs(own.step / other.step - 1) < 1e-3
 
 
 def _too_coarse(comparison: Comparison, sensor: int, own: Lattice | None, other: Lattice) -> bool:

@@ -13,10 +13,12 @@ from torch import Tensor
 
 from gyrofuse.mismatch.detectors.values.quantisation_grid import (
     Lattice,
+    distinct_values,
     exact_lattices,
     missing_lattices,
     off_lattice,
 )
+from gyrofuse.mismatch.detectors.values.truncation import cut_off_gain
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
@@ -41,6 +43,8 @@ _SHARPEST = 0.02  # smallest blur, steps: it bounds the log likelihood ratio of 
 class Quantization(Mechanism):
     """`y = offset + step round((x - offset)/step)`: an exact lattice of values, or one blurred by what came after.
 
+    A converter that drops the fraction cuts values off towards zero: the step there is twice as wide.
+
     Looks like white noise of variance `step^2/12`; the values on their lattice tell them apart. Noise added after the
     rounding is no part of it. A simulation that rounds itself, to coarser steps, does so no more.
 
@@ -52,6 +56,7 @@ class Quantization(Mechanism):
             few of them do to noise. A hidden lattice lies as far from the mean of a simulation, whose bias is its own.
         replaced: Steps of the simulation's own rounding that it takes the place of, one for each sensor, likewise; 0
             where it does not.
+        cut_off: Whether values are cut off towards zero in place of being rounded, for each sensor; none by default.
     """
 
     name: ClassVar[str] = "quantization"
@@ -63,6 +68,7 @@ class Quantization(Mechanism):
     blur: OfSensors
     centre: OfSensors
     replaced: tuple[float, ...] = ()
+    cut_off: tuple[bool, ...] = ()
 
     @classmethod
     def in_reference(cls, comparison: Comparison) -> Quantization | None:
@@ -70,12 +76,9 @@ class Quantization(Mechanism):
         side, fine = comparison.reference, _undone(comparison)
         if not fine:
             return None
-        rows = [
-            own[:2] if own is not None and i in fine else Lattice.none()[:2]
-            for i, own in enumerate(exact_lattices(side))
-        ]
-        step, offset = torch.tensor(rows, dtype=torch.float64).mT
-        return cls(step, offset, torch.zeros_like(step), side.signal.mean((0, -1)))
+        rows = [own if own is not None and i in fine else Lattice.none() for i, own in enumerate(exact_lattices(side))]
+        step, offset = torch.tensor([row[:2] for row in rows], dtype=torch.float64).mT
+        return cls(step, offset, torch.zeros_like(step), side.signal.mean((0, -1)), cut_off=_any_cut_off(rows))
 
     def undo_in_reference(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
         """The case of a simulation that was rounded so: what is built in from now on comes before that.
@@ -96,6 +99,9 @@ class Quantization(Mechanism):
         within = torch.log1p(share * torch.expm1(slope)) / slope - 0.5
         again: Callable[[Tensor], Tensor] = partial(self.apply, info=comparison.info, generator=generator)
         converter = (*comparison.converter, (self.stage, again))
+        if self.cut_off:
+            away = (side.signal / self._divisor).round().sign()
+            within = torch.where(self._cut, torch.where(away == 0, 2 * within, within + away / 2), within)
         analog = side.signal + self.step[:, None] * within
         analog = filtered(analog, partial(self._without_rounding, side, replace(side, signal=analog)))
         return self._known_of_both(replace(comparison, analog=analog, converter=converter))
@@ -141,7 +147,7 @@ class Quantization(Mechanism):
         rows = [found.get(i, Lattice.none()) for i in every]
         step, offset, blur = (torch.tensor([row[k] for row in rows], dtype=torch.float64) for k in range(3))
         replaced = tuple(coarser.get(i, Lattice.none()).step for i in every) if coarser else ()
-        effect = cls(step, offset, blur, comparison.recording.mean(-1), replaced)
+        effect = cls(step, offset, blur, comparison.recording.mean(-1), replaced, _any_cut_off(rows))
         effect = effect._placed(effect._values(comparison))
         sensors = tuple(sorted({*found, *coarser}))
         parameters = {
@@ -156,9 +162,11 @@ class Quantization(Mechanism):
         if found:
             where = comparison.info.named(tuple(found), "all sensors")
             hidden = ", hidden under what was added later" if float(blur.max()) > 0 else ""
+            cut = [i for i, own in found.items() if own.cut_off]
+            how = f", cut off towards zero in {comparison.info.named(cut, 'all of them')}" if cut else ""
             words.append(
                 f"the rate is rounded to steps of {_several(step[list(found)])} {comparison.info.measure} in {where}"
-                f"{hidden}"
+                f"{hidden}{how}"
             )
         if coarser:
             steps = _several(torch.tensor([own.step for own in coarser.values()], dtype=torch.float64))
@@ -210,10 +218,19 @@ class Quantization(Mechanism):
         offset = self.offset[:, None] + torch.where(self.blur[:, None] > 0, own, 0.0)
         records = ((signal - offset) / self._divisor).reshape(-1, *signal.shape[-2:])
         moved = [_blurred(row, float(blur)) for record in records for row, blur in zip(record, self.blur, strict=True)]
-        return torch.where(self.step[:, None] > 0, torch.stack(moved).view_as(signal) * self._divisor + offset, signal)
+        placed = torch.stack(moved).view_as(signal) * self._divisor + offset
+        if self.cut_off:
+            # A simulation's bias is its own: where zero lies is a matter of the recording's.
+            placed = torch.where(self._cut, ((signal - own) / self._divisor).trunc() * self._divisor, placed)
+        return torch.where(self.step[:, None] > 0, placed, signal)
 
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
         return held_out_blocks(self._scores(comparison), fold).sum((0, -1))
+
+    @property
+    def _cut(self) -> Tensor:
+        """Sensors whose values are cut off, `(sensor, 1)`."""
+        return torch.tensor(self.cut_off or [False] * len(self.step))[:, None]
 
     @property
     def _divisor(self) -> Tensor:
@@ -225,15 +242,16 @@ class Quantization(Mechanism):
         Or against that of the simulation's lattice, where it has one.
         """
         signal = self._values(comparison)
-        scores = _log_density(signal, self.step, self.offset, self.blur)
+        scores = _log_density(signal, self.step, self.offset, self.blur) + _cut_scores(comparison, self._cut)
         if not self.replaced:
             return scores
         own = [
-            (Lattice.none() if not step or lattice is None else lattice)[:2]
+            Lattice.none() if not step or lattice is None else lattice
             for step, lattice in zip(self.replaced, exact_lattices(comparison.reference), strict=True)
         ]
-        step, offset = torch.tensor(own, dtype=torch.float64).mT
-        return scores - _log_density(signal, step, offset, torch.zeros_like(step))
+        step, offset = torch.tensor([lattice[:2] for lattice in own], dtype=torch.float64).mT
+        cut = torch.tensor([lattice.cut_off is True for lattice in own])[:, None]
+        return scores - _log_density(signal, step, offset, torch.zeros_like(step)) - _cut_scores(comparison, cut)
 
     def apply_to_reference(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
         """The simulation's own rounding goes where this one takes its place."""
@@ -277,6 +295,24 @@ def _log_density(signal: Tensor, step: Tensor, offset: Tensor, blur: Tensor) -> 
     place = off_lattice(signal, torch.where(step > 0, step, 1.0)[:, None], offset[:, None])
     density = _wrapped_normal(place, blur.clamp(min=_SHARPEST)[:, None])
     return torch.where(step[:, None] > 0, density.clamp(min=1e-12).log(), 0.0)
+
+
+def _any_cut_off(lattices: Sequence[Lattice]) -> tuple[bool, ...]:
+    """Of each sensor; none where no sensor's values are cut off."""
+    cut = tuple(own.cut_off is True for own in lattices)
+    return cut if any(cut) else ()
+
+
+def _cut_scores(comparison: Comparison, cut: Tensor) -> Tensor:
+    """Log likelihood ratio of each sample that values are cut off towards zero, where they are said to be."""
+    side = comparison.as_came
+    scores = torch.zeros_like(side.signal[0])
+    for i in cut[:, 0].nonzero()[:, 0].tolist():
+        lattice = exact_lattices(side)[i]
+        if lattice is not None:
+            unique, counts = distinct_values(side)[i]
+            scores[i] = cut_off_gain(side.signal[0, i], unique, counts, lattice.step)
+    return scores
 
 
 def _correlation(covariance: Tensor) -> Tensor:
