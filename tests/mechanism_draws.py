@@ -69,6 +69,7 @@ from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
 from gyrofuse.mismatch.mechanisms.values.held_values import HeldValues
 from gyrofuse.mismatch.mechanisms.values.interleaving import Interleaving
+from gyrofuse.mismatch.mechanisms.values.interpolated_samples import InterpolatedSamples
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.values.sensor_gain import SensorGain
 from gyrofuse.mismatch.mechanisms.values.sensor_order import SensorOrder
@@ -140,6 +141,18 @@ def _(setting: Setting) -> Drawn:
         StuckSamples(probability, torch.zeros_like(probability), together),
         setting.of_each("probability", probability),
     )
+
+
+@draws(InterpolatedSamples)
+def _(setting: Setting) -> Drawn:
+    probability = (setting.sizes(0.01, 0.03) * setting.size).clamp(max=0.6)
+    together = setting.chance()
+    if together:
+        probability = torch.where(probability > 0, probability.max(), 0.0)
+    row = setting.sizes(4.0, 12.0, 1.0)
+    row = torch.where(row > 1, row.max(), row) if together else row
+    effect = InterpolatedSamples(probability, row, torch.zeros_like(row), together)
+    return Drawn(effect, setting.of_each("probability", probability))
 
 
 @draws(HeldValues)

@@ -11,10 +11,12 @@ import gyrofuse as gf
 from gyrofuse import AR1, WhiteNoise
 from gyrofuse.mismatch.detectors.values import quantisation_grid as lattices
 from gyrofuse.mismatch.detectors.values import values as marginals
+from gyrofuse.mismatch.detectors.values.straight_lines import straight_lines
 from gyrofuse.mismatch.detectors.variance import outliers as impulses
 from gyrofuse.mismatch.detectors.variance.noise_level import variance_p_value
 from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
+from gyrofuse.mismatch.mechanisms.values.interpolated_samples import InterpolatedSamples
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization, _blurred
 from gyrofuse.mismatch.mechanisms.values.stuck_samples import StuckSamples
 from gyrofuse.mismatch.selection.held_out import score_held_out
@@ -441,3 +443,37 @@ def test_what_a_classifier_sees_and_no_test_does_is_said() -> None:
         *(torch.from_numpy(0.35 * x) for x in (np.round(rng.standard_normal((2, 16384)) / 0.35), codes[1]))
     )
     assert not any("classifier" in note for note in same.notes)
+
+
+@pytest.mark.parametrize(("single", "length"), [(False, 12), (True, 2)])
+def test_lost_samples_that_interpolation_filled_in_are_told(single: bool, length: int) -> None:
+    recording, simulation, g = drawn(31)
+    first = torch.randperm(N // 40 - 1, generator=g)[:60] * 40 + 5
+    for a in first.tolist():
+        ends = recording[:, a], recording[:, a + length]
+        recording[:, a : a + length] = torch.lerp(
+            ends[0][:, None], ends[1][:, None], torch.arange(length, dtype=torch.float64) / length
+        )
+    if single:
+        recording = recording.float().double()
+    comparison = Comparison.of(SCENE, recording, simulation)
+    found = nominated(comparison, InterpolatedSamples)
+    assert isinstance(found.effect, InterpolatedSamples)
+    assert found.effect.together
+    assert found.effect.row.tolist() == pytest.approx([length - 1.0] * 3)
+    assert all(covers(found, f"probability[{i}]", 60 * (length - 1) / N) for i in range(3))
+    after = settled(comparison, found, g)
+    assert marginals.values_test(after).p_value > 0.001
+    assert variance_p_value(after) > 0.001
+    repaired = Comparison.of(SCENE, found.effect.apply(simulation[0], SCENE, g), simulation)
+    assert nominated(repaired, InterpolatedSamples).effect.row.tolist() == pytest.approx([length - 1.0] * 3, rel=0.5)
+
+
+@pytest.mark.parametrize("step", [0.0, 0.5])
+def test_noise_lies_on_no_lines_and_rounded_values_do_so_by_chance(step: float) -> None:
+    recording, simulation, _ = drawn(32)
+    if step:
+        recording, simulation = ((values / step).round() * step for values in (recording, simulation))
+    lines = straight_lines(Comparison.of(SCENE, recording, simulation))
+    assert not lines.inside.any()
+    assert float(lines.p_values.min()) == 1.0

@@ -64,6 +64,7 @@ from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
 from gyrofuse.mismatch.mechanisms.values.held_values import HeldValues
 from gyrofuse.mismatch.mechanisms.values.interleaving import Interleaving
+from gyrofuse.mismatch.mechanisms.values.interpolated_samples import InterpolatedSamples
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.values.sensor_gain import SensorGain
 from gyrofuse.mismatch.mechanisms.values.sensor_order import SensorOrder
@@ -78,7 +79,7 @@ def _stage_of(kind: type[Mechanism]) -> int:
 STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (SensorOrder,),  # whatever else is looked for sensor by sensor
     (UnitScale, SensorGain),
-    (Quantization, Clipping, HeldValues, StuckSamples),  # facts on the numbers themselves
+    (Quantization, Clipping, HeldValues, StuckSamples, InterpolatedSamples),  # facts on the numbers themselves
     (Spikes, SimulatedSpikes, ScaleMixture),
     (ClockSkew, TimeScale),
     (GSensitivity, QuadraticCoupling, ScaleFactor, ChannelCoupling, ChannelTransfer),

@@ -13,6 +13,7 @@ from torch import Tensor
 from gyrofuse.mismatch.decisions import CERTAIN, CHANCE
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.detectors.values.quantisation_grid import distinct_values, missing_lattices
+from gyrofuse.mismatch.detectors.values.straight_lines import straight_lines
 from gyrofuse.mismatch.detectors.values.ties import missing_recurrences, stands_alone
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
@@ -272,10 +273,14 @@ def values_test(comparison: Comparison) -> TestResult:
         (p, i, f"{found.times} times the value {found.value:.6g} {comparison.info.measure}, where values do not recur,")
         for i, (found, p) in missing_recurrences(comparison).items()
     ]
+    lines = straight_lines(comparison).p_values
+    most = int(lines.argmin())
+    p = sidak(float(lines[most]), comparison.n_sensors)
+    candidates.append((p, most, "samples on a straight line between others"))
     p, sensor, words = min(candidates)
     return TestResult(
         "marginal",
-        sidak(p, 4),
+        sidak(p, 5),
         f"{words} in sensor {comparison.info.sensors[sensor]}",
         sensors=(sensor,),
         levels=(1,),

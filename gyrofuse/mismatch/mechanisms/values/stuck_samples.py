@@ -131,7 +131,7 @@ class StuckSamples(Mechanism):
         held = self._held(comparison)[:, keep]
         share = torch.where(self.probability > 0, held.to(torch.float64).mean(-1), 0.0)
         at = self.probability.nonzero()[:, 0].tolist()
-        return replace(self, probability=share, together=_at_once(held[at], share[at]))
+        return replace(self, probability=share, together=at_once(held[at], share[at]))
 
     @property
     def _single(self) -> bool:
@@ -155,7 +155,7 @@ class StuckSamples(Mechanism):
         concerned[list(sensors)] = True
         probability = torch.where(concerned, ((share - chance) / (1 - chance)).clamp(min=0), 0.0)
         at = list(sensors)
-        together = _at_once(same[at], probability[at])
+        together = at_once(same[at], probability[at])
         length = [
             _mean_row(row, float(c), float(p)) if p > 0 else 1.0
             for row, c, p in zip(every, chance, probability, strict=True)
@@ -189,15 +189,7 @@ class StuckSamples(Mechanism):
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
         n, records = signal.shape[-1], signal.reshape(-1, *signal.shape[-2:])
-        held = torch.zeros(records.shape, dtype=torch.bool)
-        enter, leave = self._turns()
-        largest = int(self.probability.argmax())
-        for record in held:
-            for i in self.probability.nonzero()[:, 0].tolist():
-                if not self.together or i == largest:
-                    record[i] = _rows(n, float(enter[i]), float(leave[i]), generator)
-            if self.together:
-                record[self.probability > 0] = record[largest].clone()
+        held = taken_rows(records, self.probability, self._length, self.together, generator)
         held[..., 0] = False
         if self.filler:  # in the place of the first one of a row as well
             if not self._single:
@@ -213,12 +205,6 @@ class StuckSamples(Mechanism):
         if self.row:
             return torch.tensor(self.row, dtype=torch.float64)
         return 1 / (1 - self.probability.clamp(max=1 - 1e-9))
-
-    def _turns(self) -> tuple[Tensor, Tensor]:
-        """Probabilities that a row of repeats begins with a sample, and that it ends before the next, `(sensor,)`."""
-        p = self.probability.clamp(max=1 - 1e-9)
-        length = self._length.clamp(min=1.0).maximum(p / (1 - p))  # no more rows than samples between them
-        return (p / (1 - p) / length).clamp(max=1.0), 1 / length
 
     def _hangs_beside_chance(self, sensor: int) -> bool:
         """Whether rows of repeats have to be longer than those of chance to be told from them."""
@@ -240,7 +226,7 @@ class StuckSamples(Mechanism):
                 rows = [row for row in runs_of(repeats(comparison).same[i]).tolist() if row[1] - row[0] > longest]
                 if self.filler:
                     rows = runs_of(comparison.recording[i] == self.filler[i]).tolist()
-                _fill(filled[i], rows, comparison.reference.signal[0, i])
+                fill_rows(filled[i], rows, comparison.reference.signal[0, i])
         return comparison.with_recording(filled)
 
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
@@ -250,7 +236,7 @@ class StuckSamples(Mechanism):
         """Log likelihood ratio of each sample's being a repeat or not, `(sensor, time)`."""
         # A simulation without any repeats does not say that they are impossible.
         chance = self.by_chance.clamp(min=0.5 / comparison.reference.signal[:, 0].numel())
-        enter, leave = self._turns()
+        enter, leave = turns(self.probability, self._length)
         same = self._held(comparison)
         held = torch.zeros(same.shape, dtype=torch.float64)
         for i in self.probability.nonzero()[:, 0].tolist():
@@ -268,12 +254,43 @@ def repeat_scores(same: Tensor, expected: Tensor, chance: Tensor) -> Tensor:
     return torch.where(same, (expected / chance).log(), ((1 - expected) / (1 - chance)).log())
 
 
+def turns(probability: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
+    """Probabilities that a row of a mean length begins with a sample, and that it ends before the next, `(sensor,)`."""
+    p = probability.clamp(max=1 - 1e-9)
+    length = length.clamp(min=1.0).maximum(p / (1 - p))  # no more rows than samples between them
+    return (p / (1 - p) / length).clamp(max=1.0), 1 / length
+
+
+def taken_rows(
+    records: Tensor, probability: Tensor, length: Tensor, together: bool, generator: torch.Generator
+) -> Tensor:
+    """Rows of samples of `(record, sensor, time)` that are none of their own, drawn by a Markov chain.
+
+    Args:
+        records: Signals.
+        probability: Share of the samples, `(sensor,)`.
+        length: Mean length of a row, `(sensor,)`.
+        together: Whether all sensors that have such rows have them at the same time.
+        generator: Source of randomness.
+    """
+    taken = torch.zeros(records.shape, dtype=torch.bool)
+    enter, leave = turns(probability, length)
+    largest = int(probability.argmax())
+    for record in taken:
+        for i in probability.nonzero()[:, 0].tolist():
+            if not together or i == largest:
+                record[i] = _rows(records.shape[-1], float(enter[i]), float(leave[i]), generator)
+        if together:
+            record[probability > 0] = record[largest].clone()
+    return taken
+
+
 def run_lengths(true: Tensor) -> Tensor:
     """Lengths of the runs of true entries of `(time,)`, `(run,)`."""
     return runs_of(true).diff()[:, 0].to(torch.float64)
 
 
-def _at_once(held: Tensor, probability: Tensor) -> bool:
+def at_once(held: Tensor, probability: Tensor) -> bool:
     """Whether several sensors `(sensor, time)` put out none of their own at the same time, beyond chance."""
     jointly = float(held.all(0).to(torch.float64).mean() - held.to(torch.float64).mean(-1).prod())
     return len(held) > 1 and jointly > _TOGETHER * float(probability.min())
@@ -327,8 +344,8 @@ def _longest_by_chance(n: int, chance: float) -> float:
     return max(_LONG, math.log(1e3 * n) / -math.log(max(chance, 1e-12)))
 
 
-def _fill(signal: Tensor, rows: list[list[int]], simulated: Tensor) -> None:
-    """Put simulated noise, on a line from the mean before to that after, in the place of rows of repeats `(time,)`.
+def fill_rows(signal: Tensor, rows: list[list[int]], simulated: Tensor) -> None:
+    """Put simulated noise, from the mean before to that after, in the place of rows of samples `(time,)`.
 
     Args:
         signal: Recording, `(time,)`, which is changed.
@@ -338,8 +355,15 @@ def _fill(signal: Tensor, rows: list[list[int]], simulated: Tensor) -> None:
     near = 16  # samples of a mean
     whole = signal.clone()
     for a, b in rows:
-        before, after = whole[max(a - 1 - near, 0) : a - 1], whole[b : b + near]
-        ends = [float(part.mean()) if len(part) else float(whole.mean()) for part in (before, after)]
-        place = torch.arange(a, b) % len(simulated)
-        noise = simulated[place] - simulated[place].mean() if b - a > near else simulated[place] - simulated.mean()
-        signal[a:b] = noise + torch.linspace(ends[0], ends[1], b - a, dtype=signal.dtype)
+        n = b - a
+        at = near + a % max(len(simulated) - n - 2 * near, 1)
+        place = torch.arange(at, at + n) % len(simulated)
+        (low, high), (before, after) = (
+            (part[max(first - near, 0) : first], part[last : last + near])
+            for part, first, last in ((simulated, at, at + n), (whole, a - 1, b))
+        )
+        ends = [
+            float(there.mean() if len(there) else whole.mean()) - float(own.mean() if len(own) else simulated.mean())
+            for own, there in ((low, before), (high, after))
+        ]
+        signal[a:b] = simulated[place] + torch.linspace(ends[0], ends[1], n, dtype=signal.dtype)
