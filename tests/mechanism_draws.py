@@ -70,6 +70,7 @@ from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
 from gyrofuse.mismatch.mechanisms.values.held_values import HeldValues
 from gyrofuse.mismatch.mechanisms.values.interleaving import Interleaving
 from gyrofuse.mismatch.mechanisms.values.interpolated_samples import InterpolatedSamples
+from gyrofuse.mismatch.mechanisms.values.median_filter import MedianFilter
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.values.sensor_gain import SensorGain
 from gyrofuse.mismatch.mechanisms.values.sensor_order import SensorOrder
@@ -141,6 +142,14 @@ def _(setting: Setting) -> Drawn:
         StuckSamples(probability, torch.zeros_like(probability), together),
         setting.of_each("probability", probability),
     )
+
+
+@draws(MedianFilter)
+def _(setting: Setting) -> Drawn:
+    window = torch.tensor([3.0, 5.0, 7.0, 9.0], dtype=torch.float64)[setting.sizes(0.0, 3.99).long()]
+    window = torch.where(setting.sizes(1.0, 1.0) > 0, window, 1.0)
+    effect = MedianFilter(window, torch.full_like(window, 0.4), torch.zeros_like(window))
+    return Drawn(effect, setting.of_each("window", window))
 
 
 @draws(InterpolatedSamples)

@@ -6,17 +6,21 @@ import numpy as np
 import pytest
 import torch
 from mismatch_draws import LEVEL, SCENE, N, covers, drawn, even, nominated, normal, settled
+from scipy import signal
 
 import gyrofuse as gf
 from gyrofuse import AR1, WhiteNoise
+from gyrofuse.mismatch.detectors.spectra.band_tests import spectrum_test
 from gyrofuse.mismatch.detectors.values import quantisation_grid as lattices
 from gyrofuse.mismatch.detectors.values import values as marginals
+from gyrofuse.mismatch.detectors.values.median_windows import median_windows
 from gyrofuse.mismatch.detectors.values.straight_lines import straight_lines
 from gyrofuse.mismatch.detectors.variance import outliers as impulses
 from gyrofuse.mismatch.detectors.variance.noise_level import variance_p_value
 from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
 from gyrofuse.mismatch.mechanisms.values.interpolated_samples import InterpolatedSamples
+from gyrofuse.mismatch.mechanisms.values.median_filter import MedianFilter
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization, _blurred
 from gyrofuse.mismatch.mechanisms.values.stuck_samples import StuckSamples
 from gyrofuse.mismatch.selection.held_out import score_held_out
@@ -477,3 +481,25 @@ def test_noise_lies_on_no_lines_and_rounded_values_do_so_by_chance(step: float) 
     lines = straight_lines(Comparison.of(SCENE, recording, simulation))
     assert not lines.inside.any()
     assert float(lines.p_values.min()) == 1.0
+
+
+@pytest.mark.parametrize("window", [3, 5, 9])
+def test_a_running_median_is_told_and_is_no_sensor_that_repeats(window: int) -> None:
+    recording, simulation, g = drawn(33)
+    recording[:2] = torch.from_numpy(signal.medfilt(recording[:2].numpy(), (1, window)))
+    comparison = Comparison.of(SCENE, recording, simulation)
+    assert StuckSamples.detect_and_fit(comparison, LEVEL) is None
+    found = nominated(comparison, MedianFilter)
+    assert found.sensors == (0, 1)
+    assert f"a running median of {window} samples" in found.sentence
+    after = settled(comparison, found, g)
+    assert marginals.values_test(after).p_value > 0.001
+    assert spectrum_test(after).p_value > 0.001
+
+
+def test_values_that_recur_or_have_few_digits_have_passed_no_median() -> None:
+    recording, simulation, g = drawn(34)
+    recording[0] = recording[0].clamp(-1, 1)
+    recording[1] = torch.where(torch.rand(N, generator=g) < 0.1, 0.0, recording[1])
+    recording[2] = (1000 * recording[2]).round() / 1000
+    assert median_windows(Comparison.of(SCENE, recording, simulation)).samples.tolist() == [1, 1, 1]

@@ -65,6 +65,7 @@ from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
 from gyrofuse.mismatch.mechanisms.values.held_values import HeldValues
 from gyrofuse.mismatch.mechanisms.values.interleaving import Interleaving
 from gyrofuse.mismatch.mechanisms.values.interpolated_samples import InterpolatedSamples
+from gyrofuse.mismatch.mechanisms.values.median_filter import MedianFilter
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.values.sensor_gain import SensorGain
 from gyrofuse.mismatch.mechanisms.values.sensor_order import SensorOrder
@@ -79,7 +80,14 @@ def _stage_of(kind: type[Mechanism]) -> int:
 STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (SensorOrder,),  # whatever else is looked for sensor by sensor
     (UnitScale, SensorGain),
-    (Quantization, Clipping, HeldValues, StuckSamples, InterpolatedSamples),  # facts on the numbers themselves
+    (
+        MedianFilter,
+        Quantization,
+        Clipping,
+        HeldValues,
+        StuckSamples,
+        InterpolatedSamples,
+    ),  # facts on the numbers themselves
     (Spikes, SimulatedSpikes, ScaleMixture),
     (ClockSkew, TimeScale),
     (GSensitivity, QuadraticCoupling, ScaleFactor, ChannelCoupling, ChannelTransfer),

@@ -9,6 +9,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.decisions import CHANCE
+from gyrofuse.mismatch.detectors.values.median_windows import median_windows
 from gyrofuse.mismatch.detectors.values.ties import missing_recurrences
 from gyrofuse.mismatch.detectors.values.values import repeats, repeats_so_far
 from gyrofuse.mismatch.mechanisms import pictures
@@ -58,9 +60,10 @@ class StuckSamples(Mechanism):
         found = repeats(comparison)
         p_values = [sidak(float(p), comparison.n_sensors) for p in found.p_values]
         band = DeadBand.detect_and_fit(comparison, level)  # puts out its value several times running as well
-        sensors = tuple(i for i, p in enumerate(p_values) if p <= level and (band is None or i not in band.sensors))
+        others = {*median_windows(comparison).within(level), *(() if band is None else band.sensors)}
+        sensors = tuple(i for i, p in enumerate(p_values) if p <= level and i not in others)
         if not sensors:
-            return cls._filled_in(comparison, level, () if band is None else band.sensors)
+            return cls._filled_in(comparison, level, tuple(others))
         effect = cls._estimated(comparison, sensors, torch.ones(comparison.n_samples, dtype=torch.bool))
         parameters = {}
         for i in sensors:
@@ -177,6 +180,11 @@ class StuckSamples(Mechanism):
         probability = torch.where(seldom, half, found.probability)
         length = torch.where(seldom, self._length, found._length)
         return replace(found, probability=probability, row=tuple(length.tolist()))
+
+    def is_seen(self, comparison: Comparison) -> bool:
+        """Whether noise that was found later leaves values of few digits repeating as seldom as they did."""
+        own = repeats(comparison).p_values[self.probability > 0]
+        return self._single or sidak(float(own.min()), len(own)) <= CHANCE
 
     def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         if self._single:
