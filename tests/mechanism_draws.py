@@ -71,6 +71,7 @@ from gyrofuse.mismatch.mechanisms.values.held_values import HeldValues
 from gyrofuse.mismatch.mechanisms.values.interleaving import Interleaving
 from gyrofuse.mismatch.mechanisms.values.interpolated_samples import InterpolatedSamples
 from gyrofuse.mismatch.mechanisms.values.median_filter import MedianFilter
+from gyrofuse.mismatch.mechanisms.values.missing_codes import MissingCodes
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.values.sensor_gain import SensorGain
 from gyrofuse.mismatch.mechanisms.values.sensor_order import SensorOrder
@@ -150,6 +151,18 @@ def _(setting: Setting) -> Drawn:
     window = torch.where(setting.sizes(1.0, 1.0) > 0, window, 1.0)
     effect = MedianFilter(window, torch.full_like(window, 0.4), torch.zeros_like(window))
     return Drawn(effect, setting.of_each("window", window))
+
+
+@draws(MissingCodes)
+def _(setting: Setting) -> Drawn:
+    """Of a converter that the simulation has as well, which puts out all codes."""
+    step = setting.sizes(0.05, 0.1)
+    stuck, lost = (0, 0, 0, 0, -4, -4, -4, -4), (0, 0, 0, -1)
+    shifts = tuple((stuck if setting.chance() else lost) if size > 0 else () for size in step.tolist())
+    zero = torch.zeros_like(step)
+    share = torch.tensor([0.5 if own == stuck else 0.25 for own in shifts], dtype=torch.float64)
+    effect = MissingCodes(step, zero, shifts)
+    return Drawn(effect, setting.of_each("missing_share", share), simulated=Quantization(step, zero, zero, zero))
 
 
 @draws(InterpolatedSamples)

@@ -74,6 +74,7 @@ from gyrofuse.mismatch.mechanisms.values.held_values import HeldValues
 from gyrofuse.mismatch.mechanisms.values.interleaving import Interleaving
 from gyrofuse.mismatch.mechanisms.values.interpolated_samples import InterpolatedSamples
 from gyrofuse.mismatch.mechanisms.values.median_filter import MedianFilter
+from gyrofuse.mismatch.mechanisms.values.missing_codes import MissingCodes
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.values.sensor_gain import SensorGain
 from gyrofuse.mismatch.mechanisms.values.sensor_order import SensorOrder
@@ -110,6 +111,7 @@ EVERY = (
     Clipping(numbers(-0.7, -math.inf), numbers(math.inf, 1 / 3), numbers(0.1, 0.2)),
     StuckSamples(numbers(0.2, 0.1), numbers(0.01, 0.0), True),
     MedianFilter(numbers(5.0, 1.0), numbers(0.3, 0.0), numbers(0.01, 0.0)),
+    MissingCodes(numbers(1 / 3, 0.0), numbers(0.01, 0.0), ((0, 0, -1), ())),
     InterpolatedSamples(numbers(0.02, 0.0), numbers(7.3, 1.0), numbers(0.01, 0.0), True),
     HeldValues(numbers(2.5, 1.0), numbers(0.3, 0.0), numbers(0.01, 0.0)),
     StuckSamples(numbers(0.2, 0.0), numbers(0.01, 0.0), False, (7.3, 1.0), (1 / 3, 0.0)),

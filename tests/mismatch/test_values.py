@@ -14,6 +14,7 @@ from gyrofuse.mismatch.detectors.spectra.band_tests import spectrum_test
 from gyrofuse.mismatch.detectors.values import quantisation_grid as lattices
 from gyrofuse.mismatch.detectors.values import values as marginals
 from gyrofuse.mismatch.detectors.values.median_windows import median_windows
+from gyrofuse.mismatch.detectors.values.missing_codes import missing_codes
 from gyrofuse.mismatch.detectors.values.straight_lines import straight_lines
 from gyrofuse.mismatch.detectors.variance import outliers as impulses
 from gyrofuse.mismatch.detectors.variance.noise_level import variance_p_value
@@ -503,3 +504,26 @@ def test_values_that_recur_or_have_few_digits_have_passed_no_median() -> None:
     recording[1] = torch.where(torch.rand(N, generator=g) < 0.1, 0.0, recording[1])
     recording[2] = (1000 * recording[2]).round() / 1000
     assert median_windows(Comparison.of(SCENE, recording, simulation)).samples.tolist() == [1, 1, 1]
+
+
+@pytest.mark.parametrize(("stuck", "rounds"), [(True, True), (True, False), (False, True)])
+def test_codes_that_are_never_put_out_are_told(stuck: bool, rounds: bool) -> None:
+    recording, simulation, g = drawn(35)
+    step, offset = 0.1, 0.03
+    codes = ((recording - offset) / step).round().long()
+    codes[:2] = codes[:2] & ~4 if stuck else torch.where(codes[:2] % 5 == 3, codes[:2] + 1, codes[:2])
+    if rounds:
+        simulation = step * (simulation / step).round()
+    report = gf.diagnose(codes * step + offset, simulation[0], generator=g)
+    assert [f.mechanism for f in report.findings] == ["quantization"] * (not rounds) + ["missing_codes"]
+    found = report.findings[-1]
+    assert found.sensors == (0, 1)
+    assert ("bit 2 of the converter" if stuck else "1 of every 5") in found.sentence
+    assert not report.unexplained
+
+
+def test_coarse_values_of_few_codes_miss_none() -> None:
+    recording, simulation, _ = drawn(36)
+    for step in (0.02, 0.3, 1.0, 3.0):
+        comparison = Comparison.of(SCENE, step * (recording / step).round(), step * (simulation / step).round())
+        assert not missing_codes(comparison)

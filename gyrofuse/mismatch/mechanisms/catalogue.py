@@ -66,6 +66,7 @@ from gyrofuse.mismatch.mechanisms.values.held_values import HeldValues
 from gyrofuse.mismatch.mechanisms.values.interleaving import Interleaving
 from gyrofuse.mismatch.mechanisms.values.interpolated_samples import InterpolatedSamples
 from gyrofuse.mismatch.mechanisms.values.median_filter import MedianFilter
+from gyrofuse.mismatch.mechanisms.values.missing_codes import MissingCodes
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.values.sensor_gain import SensorGain
 from gyrofuse.mismatch.mechanisms.values.sensor_order import SensorOrder
@@ -80,14 +81,8 @@ def _stage_of(kind: type[Mechanism]) -> int:
 STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (SensorOrder,),  # whatever else is looked for sensor by sensor
     (UnitScale, SensorGain),
-    (
-        MedianFilter,
-        Quantization,
-        Clipping,
-        HeldValues,
-        StuckSamples,
-        InterpolatedSamples,
-    ),  # facts on the numbers themselves
+    # Facts on the numbers themselves.
+    (MedianFilter, Quantization, MissingCodes, Clipping, HeldValues, StuckSamples, InterpolatedSamples),
     (Spikes, SimulatedSpikes, ScaleMixture),
     (ClockSkew, TimeScale),
     (GSensitivity, QuadraticCoupling, ScaleFactor, ChannelCoupling, ChannelTransfer),

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.decisions import CERTAIN, CHANCE
 from gyrofuse.mismatch.detectors.result import TestResult
+from gyrofuse.mismatch.detectors.values.missing_codes import missing_codes
 from gyrofuse.mismatch.detectors.values.quantisation_grid import distinct_values, missing_lattices
 from gyrofuse.mismatch.detectors.values.straight_lines import straight_lines
 from gyrofuse.mismatch.detectors.values.ties import missing_recurrences, stands_alone
@@ -277,10 +278,11 @@ def values_test(comparison: Comparison) -> TestResult:
     most = int(lines.argmin())
     p = sidak(float(lines[most]), comparison.n_sensors)
     candidates.append((p, most, "samples on a straight line between others"))
+    candidates += [(one.p_value, i, "codes that are never put out") for i, one in missing_codes(comparison).items()]
     p, sensor, words = min(candidates)
     return TestResult(
         "marginal",
-        sidak(p, 5),
+        sidak(p, 6),
         f"{words} in sensor {comparison.info.sensors[sensor]}",
         sensors=(sensor,),
         levels=(1,),
