@@ -39,7 +39,8 @@ class MedianWindows(NamedTuple):
 def median_windows(comparison: Comparison) -> MedianWindows:
     """Windows by the largest distance of values that come back."""
     longest = 12
-    own, theirs = (_returns(side, 2 * longest) for side in (comparison.observed, comparison.reference))
+    sides = ((comparison.observed, comparison.as_came), (comparison.reference, comparison.reference))
+    own, theirs = (_returns(side, came, 2 * longest) for side, came in sides)
     n, m = (side.signal[:, 0].numel() for side in (comparison.observed, comparison.reference))
     by_chance = own[:, longest:].to(torch.float64).mean(-1, keepdim=True)  # values of few digits meet at any distance
     own, theirs = own[:, : longest - 1], theirs[:, : longest - 1]
@@ -61,10 +62,11 @@ def came_back(values: Tensor, window: int) -> Tensor:
     return again
 
 
-def _returns(side: Records, longest: int) -> Tensor:
+def _returns(side: Records, came: Records, longest: int) -> Tensor:
     """Samples that equal the one of a lag before but none between, for lags from 2 on, `(sensor, lag)`.
 
-    A value that is met all over the record, as at an end stop or in the place of lost samples, does not count.
+    A value that is met all over the record, as at an end stop or in the place of lost samples, does not count; nor do
+    values that came on a grid, whatever was taken off them.
     """
     signal = side.signal.movedim(1, 0)
     _, number, counts = signal.unique(return_inverse=True, return_counts=True)
@@ -75,5 +77,5 @@ def _returns(side: Records, longest: int) -> Tensor:
         same = torch.nn.functional.pad(signal[..., lag:] == signal[..., :-lag], (lag, 0)) & ~before
         found.append((same & seldom).sum((1, 2)))
         before = before | same
-    rounded = torch.tensor([own is not None for own in exact_lattices(side)])
+    rounded = torch.tensor([own is not None for own in exact_lattices(came)])
     return torch.where(rounded[:, None], 0, torch.stack(found, -1))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import torch
@@ -34,8 +33,8 @@ class StraightLines(NamedTuple):
 def straight_lines(comparison: Comparison) -> StraightLines:
     """Those of a recording; rows of them count once."""
     side, other = comparison.observed, comparison.reference
-    inside, chance = _inside(side)
-    theirs = _inside(other)[0]
+    inside, chance = _inside(side, comparison.as_came)
+    theirs = _inside(other, other)[0]
     n, m = inside[0].numel(), theirs[0].numel()
     p_values = []
     for own, simulated, c in zip(inside, theirs, chance.tolist(), strict=True):
@@ -45,14 +44,22 @@ def straight_lines(comparison: Comparison) -> StraightLines:
     return StraightLines(inside[:, 0], chance, torch.tensor(p_values, dtype=torch.float64))
 
 
-def _inside(side: Records) -> tuple[Tensor, Tensor]:
-    """Samples in the middle of two others, `(sensor, record, time)`, and their probability by chance, `(sensor,)`."""
+def _inside(side: Records, came: Records) -> tuple[Tensor, Tensor]:
+    """Samples in the middle of two others, `(sensor, record, time)`, and their probability by chance, `(sensor,)`.
+
+    Args:
+        side: Records.
+        came: The same before anything was taken off them: values on a grid lie on lines by chance.
+    """
     signal = side.signal.movedim(1, 0)
     single = bool((signal.to(torch.float32).to(signal.dtype) == signal).all())
     last = 1e-6 if single else 1e-12  # digit that is left after some arithmetic, of the largest value
-    digits = last * signal.abs().amax((1, 2))
+    digits = last * signal.abs().amax((1, 2))[:, None, None]
     bends, moves = signal.diff(n=2), signal.diff()[..., :-1] != 0  # what stands still is held, and on no line
-    near = (bends.abs() <= digits[:, None, None]) & moves
-    near &= torch.tensor([own is None for own in exact_lattices(side)])[:, None, None]
-    chance = 2 * digits / math.sqrt(2 * math.pi) / bends.square().mean((1, 2)).sqrt().clamp(min=1e-300)
+    near = (bends.abs() <= digits) & moves
+    near &= torch.tensor([own is None for own in exact_lattices(came)])[:, None, None]
+    # As often as differences of samples that have nothing to do with each other are the same.
+    unrelated = (signal[..., 140:] - signal[..., 90:-50]) - (signal[..., 53:-87] - signal[..., :-140])
+    alike = ((unrelated.abs() <= digits).sum((1, 2)) + 1) / unrelated[0].numel()
+    chance = alike * (unrelated.square().mean((1, 2)) / bends.square().mean((1, 2)).clamp(min=1e-300)).sqrt()
     return torch.nn.functional.pad(near, (1, 1)), chance.clamp(max=1.0)
