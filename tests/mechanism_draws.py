@@ -46,6 +46,7 @@ from gyrofuse.mismatch.mechanisms.simulated.noise import (
 )
 from gyrofuse.mismatch.mechanisms.simulated.spikes import SimulatedSpikes
 from gyrofuse.mismatch.mechanisms.slow.bias_oscillation import BiasOscillation
+from gyrofuse.mismatch.mechanisms.slow.drifting_scale import DriftingScale
 from gyrofuse.mismatch.mechanisms.slow.late_warm_up import LateWarmUp
 from gyrofuse.mismatch.mechanisms.slow.ramp import Ramp
 from gyrofuse.mismatch.mechanisms.slow.slow_effect import SlowEffect
@@ -446,6 +447,16 @@ def _(setting: Setting) -> Drawn:
         LateWarmUp(size, _none(setting), onset, tau, decays=setting.chance()),
         {"onset": onset, "time_constant": tau, **setting.of_each("size", size)},
     )
+
+
+@draws(DriftingScale)
+def _(setting: Setting) -> Drawn:
+    t = torch.arange(setting.n_samples, dtype=torch.float64) / setting.n_samples
+    temperature = 25 + 8 * (2 * math.pi * (setting.even(0.8, 1.6) * t + setting.even(0, 1))).sin() + 6 * t
+    slope = setting.signed(0.015, 0.02) * min(setting.size, 2.0)
+    effect = DriftingScale((TONE * RATE,), "temperature", 0, float(temperature.mean()), slope)
+    truth = setting.of_each("slope", 100 * slope)
+    return Drawn(effect, truth, {"temperature": temperature[None]}, tones=(TONE,))
 
 
 @draws(TemperatureDrift)

@@ -50,6 +50,7 @@ from gyrofuse.mismatch.mechanisms.simulated.noise import (
 )
 from gyrofuse.mismatch.mechanisms.simulated.spikes import SimulatedSpikes
 from gyrofuse.mismatch.mechanisms.slow.bias_oscillation import BiasOscillation
+from gyrofuse.mismatch.mechanisms.slow.drifting_scale import DriftingScale
 from gyrofuse.mismatch.mechanisms.slow.late_warm_up import LateWarmUp
 from gyrofuse.mismatch.mechanisms.slow.ramp import Ramp
 from gyrofuse.mismatch.mechanisms.slow.step import Step
@@ -122,6 +123,7 @@ EVERY = (
     ClockSkew((1,), 1e-5 / 3, ((200, 2), (300, 1)), 0.07, complex_numbers(0.3j), complex_numbers(0.1)),
     GSensitivity("acceleration", torch.tensor([[0.1, 0.2, 1 / 3], [0.0, 0.0, 0.0]], dtype=torch.float64)),
     QuadraticCoupling("acceleration", torch.tensor([[1 / 3], [0.1]], dtype=torch.float64), "axis 2"),
+    DriftingScale((7.3, 1 / 3), "temperature", 0, 25.1, numbers(0.01 / 3, 0.0)),
     ScaleFactor("rate", torch.tensor([[1e-3], [0.0]], dtype=torch.float64)),
     ChannelTransfer(("rate",), torch.tensor([[[1e-3, 0.2, 1 / 3]], [[0.0, 0.0, 0.0]]], dtype=torch.float64)),
     RingDown(

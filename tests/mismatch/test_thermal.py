@@ -9,6 +9,8 @@ import pytest
 import torch
 
 import gyrofuse as gf
+from gyrofuse.mismatch.detectors.slow.line_gains import line_gain_test
+from gyrofuse.mismatch.repair.inputs import prepared
 from gyrofuse.mismatch.signals.comparison import RecordingInfo
 
 N, RATE = 16_384, 50.0
@@ -88,3 +90,32 @@ def test_a_heater_that_is_switched_on_is_one_cause(seed: int) -> None:
 def test_steps_and_ramps_stay_what_they_are(name: str, course: np.ndarray) -> None:
     found = diagnosed(noise(11) + np.array([[0.8], [-0.5], [0.4]]) * course).findings
     assert [f.mechanism for f in found] == [name]
+
+
+def test_a_scale_factor_that_follows_temperature_is_seen_in_what_moves_the_device() -> None:
+    temperature = 25 + 15 * T / T[-1]
+    swing = 3 * np.sin(2 * np.pi * 3.1 * T)
+    slope = np.array([[0.02], [0.0], [-0.01]])
+    recording = gf.Recording(
+        torch.from_numpy(noise(41) + swing * (1 + slope * (temperature - 32.5))),
+        rate=RATE,
+        channels={"temperature": torch.from_numpy(temperature), "other": torch.from_numpy(np.cos(T / 7))},
+    )
+    report = gf.diagnose(recording, gf.Recording(torch.from_numpy(noise(42) + swing), rate=RATE))
+    (found,) = report.findings
+    assert (found.mechanism, found.sensors, found.channel) == ("scale_factor", (0, 2), "temperature")
+    assert all(within(found.parameters[f"slope[{i}]"], 100 * float(slope[i, 0])) for i in (0, 2))
+    assert report.held_out.gain > 100
+    assert not report.unexplained
+
+
+def test_a_line_that_swells_by_itself_follows_no_channel() -> None:
+    g = np.random.default_rng(5)
+    wander = np.cumsum(g.standard_normal(N)) * 0.004
+    swing = np.sin(2 * np.pi * 3.1 * T)
+    channels = {"temperature": torch.from_numpy(25 + np.cumsum(g.standard_normal(N)) * 0.01)}
+    recording = gf.Recording(torch.from_numpy(noise(43) + 3 * swing * (1 + wander)), rate=RATE, channels=channels)
+    comparison = prepared(
+        recording, gf.Recording(torch.from_numpy(noise(44) + 3 * swing), rate=RATE), None, torch.Generator()
+    )
+    assert line_gain_test(comparison).p_value > 0.001

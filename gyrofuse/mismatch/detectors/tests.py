@@ -12,6 +12,7 @@ from gyrofuse.mismatch.detectors.lines.ring_downs import ring_down_test
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.detectors.slow.channels import channel_test
 from gyrofuse.mismatch.detectors.slow.hysteresis import hysteresis_test
+from gyrofuse.mismatch.detectors.slow.line_gains import line_gain_test
 from gyrofuse.mismatch.detectors.slow.scans import slow_test
 from gyrofuse.mismatch.detectors.slow.simulated_course import simulated_course_test
 from gyrofuse.mismatch.detectors.spectra.band_tests import coherence_test, line_test, spectrum_test
@@ -30,6 +31,7 @@ TESTS: tuple[Callable[[Comparison], TestResult], ...] = (
     values_test,
     outliers_test,
     channel_test,
+    line_gain_test,
     line_test,
     interleaving_test,
     moving_line_test,

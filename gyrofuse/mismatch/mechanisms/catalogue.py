@@ -43,6 +43,7 @@ from gyrofuse.mismatch.mechanisms.simulated.noise import (
 )
 from gyrofuse.mismatch.mechanisms.simulated.spikes import SimulatedSpikes
 from gyrofuse.mismatch.mechanisms.slow.bias_oscillation import BiasOscillation
+from gyrofuse.mismatch.mechanisms.slow.drifting_scale import DriftingScale
 from gyrofuse.mismatch.mechanisms.slow.late_warm_up import LateWarmUp
 from gyrofuse.mismatch.mechanisms.slow.ramp import Ramp
 from gyrofuse.mismatch.mechanisms.slow.step import Step
@@ -85,7 +86,7 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (MedianFilter, Quantization, MissingCodes, Clipping, HeldValues, StuckSamples, InterpolatedSamples),
     (Spikes, SimulatedSpikes, ScaleMixture),
     (ClockSkew, TimeScale),
-    (GSensitivity, QuadraticCoupling, ScaleFactor, ChannelCoupling, ChannelTransfer),
+    (GSensitivity, QuadraticCoupling, ScaleFactor, DriftingScale, ChannelCoupling, ChannelTransfer),
     (Motion,),  # whose smooth course looks like any of these
     (Chirp,),  # which passes any frequency
     (RingDown, Pulses),  # whose strongest are lines too

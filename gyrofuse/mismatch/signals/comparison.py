@@ -47,8 +47,8 @@ class RecordingInfo:
         return "units" if self.unit == "unknown" else self.unit
 
     def named(self, which: Sequence[int], every: str | None = None) -> str:
-        """Sensors by their names, for a sentence; all of them by the words `every`, where given."""
-        if every is not None and len(which) == len(self.sensors):
+        """Sensors by their names, for a sentence; all of several by the words `every`, where given."""
+        if every is not None and len(which) == len(self.sensors) > 1:
             return every
         return ("sensor " if len(which) == 1 else "sensors ") + ", ".join(self.sensors[i] for i in which)
 
