@@ -248,14 +248,23 @@ def slow_analysis(comparison: Comparison) -> SlowAnalysis:
 
 def slow_test(comparison: Comparison) -> TestResult:
     """A step, a warm-up, or a temperature that the recording follows."""
-    analysis = slow_analysis(comparison)
-    scan = min(analysis.scans, key=lambda s: s.p_value)
+    return _most_significant(comparison, slow_analysis(comparison).scans)
+
+
+def steady_course_test(comparison: Comparison) -> TestResult:
+    """One of them of which a single size says all: no swing to and fro, which noise makes by itself now and then."""
+    scans = slow_analysis(comparison).scans
+    return _most_significant(comparison, [scan for scan in scans if scan.family.designs.shape[1] == 1])
+
+
+def _most_significant(comparison: Comparison, scans: Sequence[Scan]) -> TestResult:
+    scan = min(scans, key=lambda s: s.p_value)
     largest = max(scan.sensors, key=lambda i: float(scan.z[i].norm()))
     seconds = scan.point[0] / comparison.info.rate
     words = scan.family.words.format(seconds)
     return TestResult(
         "slow",
-        sidak(scan.p_value, len(analysis.scans)),
+        sidak(scan.p_value, len(scans)),
         f"{words}, most clearly in sensor {comparison.info.sensors[largest]}",
         sensors=scan.sensors,
         time_s=seconds if scan.family.timed else None,

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from gyrofuse.mismatch.detectors.exchanged import exchanged
 from gyrofuse.mismatch.detectors.result import TestResult
-from gyrofuse.mismatch.detectors.slow.scans import slow_test
+from gyrofuse.mismatch.detectors.slow.scans import steady_course_test
 from gyrofuse.mismatch.signals.comparison import Comparison
 
 
@@ -20,5 +20,5 @@ def simulated_course_test(comparison: Comparison) -> TestResult:
     name = "simulated course"
     if not may_have_a_course(comparison):
         return TestResult(name, 1.0, "the simulation is no single record that could have a course of its own")
-    found = slow_test(exchanged(comparison))
+    found = steady_course_test(exchanged(comparison))
     return replace(found, test=name, words=f"in the simulation alone {found.words}", time_s=None)
