@@ -56,6 +56,9 @@ class SimulatedCourse(Mechanism):
 
     def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         self.added.plot(exchanged(comparison), ax, sensor=sensor, fitted=fitted)
+        legend = ax.get_legend()
+        if legend is not None:  # the simulation is in the place of the recording
+            legend.get_texts()[0].set_text("simulation")
 
 
 @dataclass(frozen=True, eq=False)

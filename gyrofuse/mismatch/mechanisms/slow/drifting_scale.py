@@ -9,6 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from gyrofuse._base.axes import DASHED, INK, finish
 from gyrofuse.mismatch.detectors.slow.line_gains import LineGains, line_gains
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
@@ -102,11 +103,13 @@ class DriftingScale(Mechanism):
         gains = line_gains(comparison)
         if gains is None:
             return
-        ax.plot(self.reference + gains.course, gains.sizes[sensor], ".", color="C0")
+        x = (self.reference + gains.course).numpy()
+        handles = ax.plot(x, gains.sizes[sensor].numpy(), linestyle="none", marker="o", markersize=3, color=INK)
         if fitted:
-            ax.plot(self.reference + gains.course, 1 + self.slope[sensor] * gains.course, "--", color="C1")
-        ax.set_xlabel(self.channel)
-        ax.set_ylabel("size of what moves it, over its mean")
+            handles += ax.plot(x, (1 + self.slope[sensor] * gains.course).numpy(), **DASHED)
+        ax.set_xlabel(self.channel, parse_math=False)
+        ax.set_ylabel("size of the line, over its mean")
+        finish(ax, handles, ["recording", "fitted"][: len(handles)])
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
         return signal + self._path(signal, info)
