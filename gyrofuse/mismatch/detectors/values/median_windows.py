@@ -11,7 +11,7 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from gyrofuse.mismatch.detectors.values.quantisation_grid import exact_lattices
+from gyrofuse.mismatch.detectors.values.quantisation_grid import distinct_values, exact_lattices
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.records import Records
@@ -39,6 +39,9 @@ class MedianWindows(NamedTuple):
 def median_windows(comparison: Comparison) -> MedianWindows:
     """Windows by the largest distance of values that come back."""
     longest = 12
+    if all(int(counts.max()) == 1 for _, counts in distinct_values(comparison.observed)):  # no value is met twice
+        none = torch.ones(comparison.n_sensors, dtype=torch.int64)
+        return MedianWindows(none, none.to(torch.float64))
     sides = ((comparison.observed, comparison.as_came), (comparison.reference, comparison.reference))
     own, theirs = (_returns(side, came, 2 * longest) for side, came in sides)
     n, m = (side.signal[:, 0].numel() for side in (comparison.observed, comparison.reference))
