@@ -17,7 +17,7 @@ from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.detectors.spectra.fit_verdict import KNOWN, fit_verdict
 from gyrofuse.mismatch.detectors.tests import TESTS, family_wise_p_value, run_tests
 from gyrofuse.mismatch.detectors.variance.rest import rest_words
-from gyrofuse.mismatch.mechanisms.mechanism import Context, repaired
+from gyrofuse.mismatch.mechanisms.mechanism import Context, Mechanism, repaired
 from gyrofuse.mismatch.repair.inputs import Simulation, modelled, on_processor, prepared, same_data_words
 from gyrofuse.mismatch.repair.noise_model import noise_of, noise_samples
 from gyrofuse.mismatch.repair.reference_effects import with_own_effects
@@ -26,7 +26,7 @@ from gyrofuse.mismatch.reporting.judge import checked_judge, judged
 from gyrofuse.mismatch.reporting.report import MismatchReport
 from gyrofuse.mismatch.selection.backward import eliminate, nearer
 from gyrofuse.mismatch.selection.discrepancy import discrepancy_left
-from gyrofuse.mismatch.selection.forward import select
+from gyrofuse.mismatch.selection.forward import Selected, select
 from gyrofuse.mismatch.selection.held_out import HeldOut, agreement
 from gyrofuse.mismatch.selection.leftovers import repair_leftovers
 from gyrofuse.mismatch.selection.null_replicates import FEWEST, twin_p_values
@@ -138,12 +138,7 @@ def diagnose(
             repaired=start,
             fit=fit_verdict(start, level),
         )
-    selected, comparison = select(
-        start, level, generator, lambda what, share: progress(what, _TESTED + (_FOUND - _TESTED) * share)
-    )
-    progress("alternatives", _FOUND)
-    selected, comparison = eliminate(selected, comparison, level, generator)
-    selected, comparison = nearer(selected, start, comparison, generator)
+    selected, comparison = _searched(start, level, generator, progress)
     found = [one.finding for one in selected]
     findings = tuple(
         replace(f, context=Context(start, tuple(other.effect for other in found if other is not f))) for f in found
@@ -197,6 +192,27 @@ def _told(held_out: HeldOut) -> str:
 def _significant(results: tuple[TestResult, ...], false_alarm: float) -> list[TestResult]:
     """Results of tests that see a difference."""
     return [result for result in results if sidak(result.p_value, len(results)) <= false_alarm]
+
+
+def _searched(
+    start: Comparison, level: float, generator: torch.Generator, progress: Callable[[str, float], None]
+) -> tuple[list[Selected], Comparison]:
+    """Findings that hold together, and recording and simulation with all of them repaired.
+
+    What turns out to lead the simulation away may have stood in another one's place: it is searched once more without.
+    """
+    but_for: frozenset[type[Mechanism]] = frozenset()
+    while True:
+        selected, comparison = select(
+            start, level, generator, lambda what, share: progress(what, _TESTED + (_FOUND - _TESTED) * share), but_for
+        )
+        progress("alternatives", _FOUND)
+        selected, comparison = eliminate(selected, comparison, level, generator)
+        kept, comparison = nearer(selected, start, comparison, generator)
+        gone = {type(one.finding.effect) for one in selected} - {type(one.finding.effect) for one in kept}
+        if but_for or not gone:
+            return kept, comparison
+        but_for = frozenset(gone)
 
 
 def _unrounded(comparison: Comparison) -> Comparison:

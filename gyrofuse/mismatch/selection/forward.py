@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -38,6 +38,7 @@ def select(
     level: float,
     generator: torch.Generator,
     progress: Callable[[str, float], None],
+    but_for: Collection[type[Mechanism]] = (),
 ) -> tuple[list[Selected], Comparison]:
     """Findings in the order in which they were found, and recording and simulation with all of them repaired.
 
@@ -49,16 +50,18 @@ def select(
         level: Largest p value of a finding.
         generator: Source of the random numbers of what is applied to the simulation.
         progress: Function of what is searched for, and of the share of the stages that are done.
+        but_for: Mechanisms that are not searched for.
     """
+    stages = [tuple(kind for kind in stage if kind not in but_for) for stage in STAGES]
     comparison, selected = start, list[Selected]()
-    for number, stage in enumerate(STAGES):
+    for number, stage in enumerate(stages):
         if len({i for one in selected for i in one.finding.hides}) == start.n_sensors:
             break
-        progress(", ".join(kind.name for kind in stage), number / len(STAGES))
+        progress(", ".join(kind.name for kind in stage), number / len(stages))
         before = len(selected)
         comparison = _exhausted(stage, selected, start, comparison, level, generator)
         if number in AGAIN and len(selected) > before:
-            comparison = _exhausted(STAGES[AGAIN[number]], selected, start, comparison, level, generator)
+            comparison = _exhausted(stages[AGAIN[number]], selected, start, comparison, level, generator)
     return selected, comparison
 
 
