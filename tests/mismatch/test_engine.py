@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import json
 import math
+import sys
 
 import pytest
 import torch
@@ -13,13 +14,14 @@ from scipy import stats
 
 import gyrofuse as gf
 from gyrofuse.mismatch import MismatchReport, diagnose, discrepancy
+from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
 from gyrofuse.mismatch.mechanisms.spectra.bumps.oscillation import Mode
 from gyrofuse.mismatch.mechanisms.spectra.bumps.resonance import Resonance
 from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter
 from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.values.unit_scale import UnitScale
 from gyrofuse.mismatch.repair.inputs import prepared
-from gyrofuse.mismatch.selection.forward import is_known
+from gyrofuse.mismatch.selection.forward import is_known, select
 from gyrofuse.mismatch.selection.null_replicates import twin, twin_p_values
 from gyrofuse.mismatch.signals.comparison import RecordingInfo
 from gyrofuse.mismatch.stats.multiplicity import monte_carlo_p_value
@@ -329,3 +331,24 @@ def test_what_lies_on_a_device_is_diagnosed_as_it_is_beside_the_processor():
 
 def model_on_device(model: gf.Model) -> gf.Model:
     return model.with_params(model.params.cuda(), estimated_from=model.estimated_from)
+
+
+def test_what_leads_away_is_searched_without(monkeypatch: pytest.MonkeyPatch):
+    """Once: what was found in its place may have been hidden behind it."""
+    module = sys.modules[diagnose.__module__]
+    searches, first = [], module.nearer
+
+    def search(start, level, generator, progress, but_for):
+        searches.append(but_for)
+        return select(start, level, generator, progress, but_for)
+
+    def none_of_tones(selected, start, comparison, generator):
+        kept = [one for one in selected if one.finding.mechanism != "vibration_tone"]
+        return first(kept, start, comparison, generator)
+
+    monkeypatch.setattr(module, "select", search)
+    monkeypatch.setattr(module, "nearer", none_of_tones)
+    found = diagnose(with_tone(array(1, 2**13), 1.0), array(2, 2**13))
+    assert searches == [frozenset(), frozenset({VibrationTone})]
+    assert "vibration_tone" not in [f.mechanism for f in found.findings]
+    assert found.unexplained  # nothing else explains it
