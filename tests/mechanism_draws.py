@@ -134,12 +134,15 @@ def _(setting: Setting) -> Drawn:
     return Drawn(Clipping(low, high, setting.clean.mean(-1)), truth)
 
 
+def _shares(setting: Setting, low: float, high: float, most: float) -> tuple[Tensor, bool]:
+    """Of samples that are none of their own, `(sensor,)`, and whether all sensors concerned lose them at once."""
+    share, together = (setting.sizes(low, high) * setting.size).clamp(max=most), setting.chance()
+    return (torch.where(share > 0, share.max(), 0.0) if together else share), together
+
+
 @draws(StuckSamples)
 def _(setting: Setting) -> Drawn:
-    probability = (setting.sizes(0.001, 0.003) * setting.size).clamp(max=0.9)
-    together = setting.chance()
-    if together:
-        probability = torch.where(probability > 0, probability.max(), 0.0)
+    probability, together = _shares(setting, 0.001, 0.003, 0.9)
     return Drawn(
         StuckSamples(probability, torch.zeros_like(probability), together),
         setting.of_each("probability", probability),
@@ -168,10 +171,7 @@ def _(setting: Setting) -> Drawn:
 
 @draws(InterpolatedSamples)
 def _(setting: Setting) -> Drawn:
-    probability = (setting.sizes(0.01, 0.03) * setting.size).clamp(max=0.6)
-    together = setting.chance()
-    if together:
-        probability = torch.where(probability > 0, probability.max(), 0.0)
+    probability, together = _shares(setting, 0.01, 0.03, 0.6)
     row = setting.sizes(4.0, 12.0, 1.0)
     row = torch.where(row > 1, row.max(), row) if together else row
     effect = InterpolatedSamples(probability, row, torch.zeros_like(row), together)
@@ -449,10 +449,15 @@ def _(setting: Setting) -> Drawn:
     )
 
 
+def _temperature(setting: Setting) -> Tensor:
+    """That goes up and down, and on the whole up, `(time,)`, degC."""
+    t = torch.arange(setting.n_samples, dtype=torch.float64) / setting.n_samples
+    return 25 + 8 * (2 * math.pi * (setting.even(0.8, 1.6) * t + setting.even(0, 1))).sin() + 6 * t
+
+
 @draws(DriftingScale)
 def _(setting: Setting) -> Drawn:
-    t = torch.arange(setting.n_samples, dtype=torch.float64) / setting.n_samples
-    temperature = 25 + 8 * (2 * math.pi * (setting.even(0.8, 1.6) * t + setting.even(0, 1))).sin() + 6 * t
+    temperature = _temperature(setting)
     slope = setting.signed(0.015, 0.02) * min(setting.size, 2.0)
     effect = DriftingScale((TONE * RATE,), "temperature", 0, float(temperature.mean()), slope)
     truth = setting.of_each("slope", 100 * slope)
@@ -461,8 +466,7 @@ def _(setting: Setting) -> Drawn:
 
 @draws(TemperatureDrift)
 def _(setting: Setting) -> Drawn:
-    t = torch.arange(setting.n_samples, dtype=torch.float64) / setting.n_samples
-    temperature = 25 + 8 * (2 * math.pi * (setting.even(0.8, 1.6) * t + setting.even(0, 1))).sin() + 6 * t
+    temperature = _temperature(setting)
     lag = 0.0 if setting.chance() else setting.even(0.02, 0.06) * setting.n_samples / RATE
     size = setting.signed(0.3, 0.4) * setting.size
     curvature = (setting.signed(0.01, 0.02),) if setting.size > 1 else ()

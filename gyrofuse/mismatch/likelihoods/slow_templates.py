@@ -184,8 +184,7 @@ def _temperature_designs(
 
 def lagged(info: RecordingInfo, channel: str, row: int, lag: float, n_samples: int) -> Tensor:
     """Temperature of what follows a channel with a lag in samples, `tau dy/dt = x - y`, from equilibrium, `(time,)`."""
-    x = info.channels[channel]
-    x = x.reshape(-1, x.shape[-1])[row].to(torch.float64)
+    x = info.channel_rows(channel)[row]
     if len(x) < n_samples:
         raise ValueError(
             f"`channels`: expected {channel!r} at {n_samples} samples or more, got {len(x)}; "

@@ -52,6 +52,11 @@ class RecordingInfo:
             return every
         return ("sensor " if len(which) == 1 else "sensors ") + ", ".join(self.sensors[i] for i in which)
 
+    def channel_rows(self, name: str) -> Tensor:
+        """An auxiliary channel as its rows, `(row, time)`: one of a single row may be given as `(time,)`."""
+        values = self.channels[name].to(torch.float64)
+        return values.reshape(-1, values.shape[-1])
+
     def seconds(self, n_samples: int) -> Tensor:
         """Times of the samples, s."""
         return torch.arange(n_samples, dtype=torch.float64) / self.rate

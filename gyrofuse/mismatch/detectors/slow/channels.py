@@ -211,8 +211,7 @@ def channel_test(comparison: Comparison) -> TestResult:
     """Gains of the sensors on fast channels and on the products of their rows."""
     tried = []
     for name in [*accelerations(comparison), *rates(comparison), *auxiliary(comparison)]:
-        rows = comparison.info.channels[name].to(torch.float64)
-        rows = rows.reshape(-1, rows.shape[-1])
+        rows = comparison.info.channel_rows(name)
         kinds = [("", rows)]
         if name in accelerations(comparison):
             kinds += [(" squared", made) for made in squared(rows).values()]

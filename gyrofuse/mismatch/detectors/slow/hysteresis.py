@@ -41,8 +41,7 @@ def strongest_relay(comparison: Comparison) -> Scan | None:
     """The best relay, corrected for all channels and thresholds."""
     families = []
     for channel, row in temperature_rows(comparison):
-        values = comparison.info.channels[channel]
-        means = block_means(values.reshape(-1, values.shape[-1])[row].to(torch.float64)[: comparison.n_samples])
+        means = block_means(comparison.info.channel_rows(channel)[row, : comparison.n_samples])
         paths = relays(means)
         if len(paths) > 1:
             number = torch.arange(len(paths), dtype=torch.float64)[:, None]

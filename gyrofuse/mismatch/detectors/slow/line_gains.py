@@ -51,11 +51,8 @@ def line_gains(comparison: Comparison) -> LineGains | None:
     block = comparison.block
     cycles, apart = 2.05, 4  # cycles of a line in a block (two are the taper's width), and its bins to its neighbours
     usable = [f for f in lines if f * block > cycles and (0.5 - f) * block > cycles]
-    rows = [
-        (name, k, row)
-        for name, values in comparison.info.channels.items()
-        for k, row in enumerate(values.to(torch.float64).view(-1, values.shape[-1]))
-    ]
+    info = comparison.info
+    rows = [(name, k, row) for name in info.channels for k, row in enumerate(info.channel_rows(name))]
     if not usable or not rows:
         return None
     whole = line_parts(comparison.recording, tuple(usable))  # (sensor, line)

@@ -79,8 +79,8 @@ class ChannelNoise(LevelCourse):
         bends = (0.0, 1.0, 3.0, 10.0)  # with 1 a sd that grows in a line to twice what it was has a factor of 4
         tried = [
             (name, row, kind, values)
-            for name, channel in info.channels.items()
-            for row, values in enumerate(_rows(channel))
+            for name in info.channels
+            for row, values in enumerate(info.channel_rows(name))
             for kind, values in _courses(values).items()
         ]
         fitted = [(entry, _fitted(white, entry[-1], _ends(entry[-1]), 0.0)) for entry in tried if _moves(entry[-1])]
@@ -110,7 +110,7 @@ class ChannelNoise(LevelCourse):
         largest = max(sensors, key=lambda i: abs(math.log(float(known.factor[i]))))
         return effect.found(
             f"the noise's variance in {info.named(sensors, 'all sensors')} follows {_WORDS[kind]}{readable(name)}"
-            f"{f' (row {row + 1})' if len(_rows(info.channels[name])) > 1 else ''}: it changes by a factor of "
+            f"{f' (row {row + 1})' if len(info.channel_rows(name)) > 1 else ''}: it changes by a factor of "
             f"{float(known.factor[largest]):.3g} (sensor {info.sensors[largest]}) from {float(ends[0]):.4g} to "
             f"{float(ends[1]):.4g} of it",
             p_value,
@@ -130,12 +130,7 @@ class ChannelNoise(LevelCourse):
         return known.of_length(n_samples)
 
     def _share(self, info: RecordingInfo) -> Tensor:
-        return _share(_courses(_rows(info.channels[self.channel])[self.row])[self.kind], self.ends, self.bend)
-
-
-def _rows(channel: Tensor) -> list[Tensor]:
-    """Rows of a channel `(time,)` or `(row, time)`."""
-    return list(channel.to(torch.float64).reshape(-1, channel.shape[-1]))
+        return _share(_courses(info.channel_rows(self.channel)[self.row])[self.kind], self.ends, self.bend)
 
 
 def _courses(values: Tensor) -> Mapping[str, Tensor]:

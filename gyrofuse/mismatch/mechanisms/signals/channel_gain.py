@@ -185,8 +185,7 @@ class ChannelGain(KnownPath):
 
     @classmethod
     def _rows(cls, info: RecordingInfo, name: str) -> dict[str, Tensor]:
-        values = info.channels[name].to(torch.float64)
-        kinds = cls.rows(values.reshape(-1, values.shape[-1]))
+        kinds = cls.rows(info.channel_rows(name))
         return {kind: rows - rows.mean(-1, keepdim=True) for kind, rows in kinds.items()}
 
     @classmethod
@@ -204,7 +203,7 @@ def _only(gains: Tensor, sensors: tuple[int, ...]) -> Tensor:
 
 def gravity_unit(info: RecordingInfo, name: str) -> str | None:
     """Unit of a channel of acceleration, by the size of gravity in it."""
-    size = float(info.channels[name].to(torch.float64).reshape(-1, info.channels[name].shape[-1]).mean(-1).norm())
+    size = float(info.channel_rows(name).mean(-1).norm())
     return next(
         (unit for unit, one in (("g", 1.0), ("m/s^2", GRAVITY)) if abs(math.log(max(size, 1e-9) / one)) < 0.2), None
     )

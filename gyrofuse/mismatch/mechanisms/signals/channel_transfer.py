@@ -207,13 +207,13 @@ def _rows(info: RecordingInfo, channels: Sequence[str], n_samples: int) -> Tenso
     """Rows of channels less their means, `(row, time)`."""
     rows = []
     for channel in channels:
-        values = info.channels[channel].to(torch.float64)
+        values = info.channel_rows(channel)
         if values.shape[-1] < n_samples:
             raise ValueError(
                 f"`channels`: expected {n_samples} samples of {channel!r}, which the sensors follow, got "
                 f"{values.shape[-1]}; give the channel for the whole simulation"
             )
-        rows.append(values.reshape(-1, values.shape[-1])[:, :n_samples])
+        rows.append(values[:, :n_samples])
     every = torch.cat(rows)
     return every - every.mean(-1, keepdim=True)
 

@@ -53,7 +53,7 @@ class DriftingScale(Mechanism):
         sensors = tuple((gains.p_values * comparison.n_sensors <= max(level, 0.01)).nonzero()[:, 0].tolist())
         concerned = torch.zeros(comparison.n_sensors, dtype=torch.bool)
         concerned[list(sensors)] = True
-        reference = float(_row(info, gains.channel, gains.row).mean())
+        reference = float(info.channel_rows(gains.channel)[gains.row].mean())
         lines = tuple(f * info.rate for f in comparison.reference.lines)
         effect = cls(lines, gains.channel, gains.row, reference, torch.where(concerned, gains.slope, 0.0))
         parameters = {}
@@ -122,7 +122,7 @@ class DriftingScale(Mechanism):
 
     def _path(self, signal: Tensor, info: RecordingInfo) -> Tensor:
         """What signals `(..., sensor, time)` have more of their lines than at `T0`."""
-        course = _row(info, self.channel, self.row) - self.reference
+        course = info.channel_rows(self.channel)[self.row] - self.reference
         n = min(signal.shape[-1], len(course))
         t, path = torch.arange(n, dtype=torch.float64), torch.zeros_like(signal)
         frequencies = tuple(f / info.rate for f in self.frequencies_hz)
@@ -132,8 +132,3 @@ class DriftingScale(Mechanism):
             path[..., :n] += own.real * angle.cos() - own.imag * angle.sin()
         path[..., :n] *= self.slope[:, None] * course[:n]
         return path
-
-
-def _row(info: RecordingInfo, channel: str, row: int) -> Tensor:
-    values = info.channels[channel].to(torch.float64)
-    return values.reshape(-1, values.shape[-1])[row]
