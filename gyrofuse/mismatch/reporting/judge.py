@@ -141,8 +141,8 @@ def judged(
         return torch.tensor(folds, dtype=torch.float64), given
 
     def drawn(model: RepairedModel | SessionModel) -> Recording | Tensor:
-        """Samples of a repaired simulation for the judge."""
-        return records_for(model, judge, _RECORDS, _whole_channels(judge), generator)
+        """Samples of a repaired simulation for the judge, with the same noise whatever it was repaired by."""
+        return records_for(model, judge, _RECORDS, _whole_channels(judge), torch.Generator().manual_seed(1))
 
     def told(given: Comparison) -> float:
         """The area under the classifier's curve."""

@@ -171,6 +171,24 @@ def power_tails(comparison: Comparison) -> Tensor:
     return tails.clamp(max=1.0).masked_fill(s <= 0, math.nan)
 
 
+def excess_p_value(comparison: Comparison, low: float, high: float) -> float:
+    """p value, for all bands and sensors, of more power in a band that lies between two frequencies or reaches there.
+
+    Args:
+        comparison: Recording and simulation.
+        low, high: Cycles per sample.
+    """
+    tails, edges = power_tails(comparison), comparison.bands.edges
+    near = [
+        b
+        for b in range(tails.shape[1])
+        if edges[b] < high * comparison.n_samples and edges[b + 1] > low * comparison.n_samples
+    ]
+    more = (comparison.observed.power > comparison.reference.power) & tails.isfinite()
+    there = tails.where(more, 1.0)[:, near]
+    return sidak(float(there.min()), int(tails.isfinite().sum())) if there.numel() else 1.0
+
+
 def level_of(frequency: float) -> int:
     """Wavelet level whose octave `(2^-j-1, 2^-j)` holds a frequency in cycles per sample, from 1."""
     return max(math.floor(-math.log2(frequency)), 1)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.detectors.lines.chirps import swept
-from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
+from gyrofuse.mismatch.detectors.spectra.band_tests import excess_p_value, level_of
 from gyrofuse.mismatch.detectors.spectra.peak_fit import Oscillation, oscillation_of
 from gyrofuse.mismatch.detectors.spectra.peaks import Stretch
 from gyrofuse.mismatch.detectors.spectra.steadiness import Steadiness, steadiness
@@ -130,7 +130,7 @@ class Seen(NamedTuple):
 
 def nominated(comparison: Comparison, level: float, *, tone: bool) -> tuple[Mode, Seen] | None:
     """The strongest bump, if it is a tone, or if it is none."""
-    peak = oscillation_of(comparison)
+    peak = _with_bands(comparison, oscillation_of(comparison))
     rivals: tuple[str, ...] = ()
     if peak is None or peak.stretch.p_value > level:
         shape = chosen_shape(comparison, "resonance", level)
@@ -151,6 +151,19 @@ def nominated(comparison: Comparison, level: float, *, tone: bool) -> tuple[Mode
     gain = peak.variance.clamp(min=0).sqrt().to(torch.complex128) if peak.gain is None else peak.gain
     mode = Mode(peak.centre, peak.width, gain, peak.gain is not None)
     return mode, Seen(comparison, peak, verdict, sensors, rivals)
+
+
+def _with_bands(comparison: Comparison, peak: Oscillation | None) -> Oscillation | None:
+    """A bump with the p value of more power in the bands where it stands, if that is the smaller one.
+
+    Of a bump of its own that is plain enough where it is looked for among all: bands are fewer than places and widths.
+    """
+    plain = 0.01  # p value
+    if peak is None or peak.stretch.p_value > plain:
+        return peak
+    low, high = peak.centre - peak.width, peak.centre + peak.width
+    p_value = min(peak.stretch.p_value, excess_p_value(comparison, low, high))
+    return replace(peak, stretch=peak.stretch._replace(p_value=p_value))
 
 
 def _seen(peak: Oscillation) -> tuple[Tensor, int]:
