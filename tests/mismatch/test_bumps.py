@@ -10,6 +10,7 @@ import torch
 from scipy import stats
 from shape_draws import CHANGES, RATE, SIGNS, N, P, array, comparison, drawn, generator, nominated, oscillating, tensor
 
+from gyrofuse.mismatch.detectors.spectra.band_tests import excess_p_value
 from gyrofuse.mismatch.detectors.spectra.modulated_ordinates import inflation, level_correlations
 from gyrofuse.mismatch.detectors.spectra.own_peak_scan import _scores, _shape, scanned_own_peaks
 from gyrofuse.mismatch.detectors.spectra.peak_fit import Background, Oscillation, oscillation_of
@@ -20,6 +21,7 @@ from gyrofuse.mismatch.likelihoods.spectra.common_sources import CommonBump
 from gyrofuse.mismatch.likelihoods.spectra.components import oscillation
 from gyrofuse.mismatch.likelihoods.spectra.fit import fit, pieces, slopes_of_spectra
 from gyrofuse.mismatch.mechanisms.spectra.bumps.oscillation import Mode, _momentary, _seen, excess_along, wandering_sd
+from gyrofuse.mismatch.mechanisms.spectra.bumps.oscillation import nominated as nominated_bump
 from gyrofuse.mismatch.mechanisms.spectra.bumps.resonance import Resonance
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import compared
 from gyrofuse.mismatch.signals.filters import noise
@@ -110,6 +112,27 @@ def test_a_line_is_no_bump_and_a_bump_of_both_sides_neither():
     g = generator(10)
     both = [array().simulate(N, generator=g) + 0.005 * oscillating(g, 0.1, 0.002, P) for _ in range(3)]
     assert strongest_peak(comparison(both[0], torch.stack(both[1:]))).p_value > 1e-3
+
+
+def test_more_power_in_a_band_tells_of_a_broad_bump_that_stands_out_among_all_places():
+    has = tensor(1, 0, 0, 0, 0, 0)
+    given = drawn(902, lambda x, g: x + 2.2e-3 * has[:, None] * oscillating(g, 0.12, 0.01, P))
+    scanned, bands = strongest_peak(given).p_value, excess_p_value(given, 0.11, 0.13)
+    assert bands < 1e-7 < scanned < 1e-5
+    found = Resonance.detect_and_fit(given, 1e-7)
+    assert found is not None
+    assert found.p_value == bands
+    assert found.sensors == (0,)
+    assert excess_p_value(given, 0.2, 0.22) > 0.01
+    without = replace(given, observed=given.reference, reference=given.observed)  # less power there, not more
+    assert excess_p_value(without, 0.11, 0.13) > 0.01
+
+
+def test_more_power_without_a_bump_is_none():
+    """Bands alone, where nothing stands out beside its flanks: a level, or a slope."""
+    louder = drawn(903, lambda x, g: 1.25 * x)
+    assert excess_p_value(louder, 0.11, 0.13) < 1e-6
+    assert nominated_bump(louder, 1e-3, tone=False) is None
 
 
 @pytest.mark.statistical

@@ -15,6 +15,10 @@ from pages import Page
 from torch import Tensor
 
 import gyrofuse as gf
+from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
+from gyrofuse.mismatch.repair.repaired_model import RepairedModel
+from gyrofuse.mismatch.reporting.judge import judged
+from gyrofuse.mismatch.signals.comparison import RecordingInfo
 
 N, RATE = 5003, 50.0
 NOISE = gf.ArrayModel.from_sensors([gf.WhiteNoise(1.0 + i / 10) + gf.AR1(0.98, 1e-3) for i in range(2)])
@@ -64,6 +68,16 @@ def test_shares_say_what_carries_the_discrepancy():
     named = 100 * sum(share.share for share in j.shares)
     assert f"on the other recording, mechanisms with names carry {named:.3g} %" in str(report)
     assert report.to_dict()["judged"]["shares"][0]["name"] == j.shares[0].name
+
+
+def test_what_does_next_to_nothing_carries_nothing():
+    """Every repair is judged with the same noise: else each would carry the chance of another draw."""
+    faint = VibrationTone(5.5, torch.full((2,), 1e-4, dtype=torch.float64), torch.zeros(2, dtype=torch.float64))
+    info = RecordingInfo(RATE, "deg/s", ("1", "2"))
+    model, judge = RepairedModel(NOISE, info, (faint, faint)), recording(drawn(2) + tone())
+    j = judged(judge, [recording(drawn(1) + tone())], NOISE, [model], None)
+    assert [share.name for share in j.shares] == 2 * ["vibration_tone"]
+    assert abs(j.shares[1].share) < 1e-4
 
 
 def test_a_repair_of_what_was_there_once_does_not():
