@@ -14,14 +14,10 @@ from torch import Tensor
 import gyrofuse as gf
 from gyrofuse.mismatch.likelihoods.spectra.filter_forms import filter_strength
 from gyrofuse.mismatch.mechanisms.regimes.channel_noise import ChannelNoise
-from gyrofuse.mismatch.mechanisms.regimes.chirp import Chirp
 from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
-from gyrofuse.mismatch.mechanisms.regimes.pulses import Pulses
-from gyrofuse.mismatch.mechanisms.regimes.ring_down import RingDown
 from gyrofuse.mismatch.mechanisms.regimes.scale_mixture import ScaleMixture
 from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
 from gyrofuse.mismatch.mechanisms.regimes.telegraph import RandomTelegraph
-from gyrofuse.mismatch.mechanisms.regimes.tone_in_spells import ToneInSpells
 from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
 from gyrofuse.mismatch.mechanisms.remainders.coherence import CoherenceRemainder
 from gyrofuse.mismatch.mechanisms.remainders.slow import SlowRemainder
@@ -65,6 +61,12 @@ from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.moved_low_pass import MovedLowPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.notch import NotchFilter
 from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
+from gyrofuse.mismatch.mechanisms.transients.channel_line import ChannelLine
+from gyrofuse.mismatch.mechanisms.transients.channel_tone import ChannelTone
+from gyrofuse.mismatch.mechanisms.transients.chirp import Chirp
+from gyrofuse.mismatch.mechanisms.transients.pulses import Pulses
+from gyrofuse.mismatch.mechanisms.transients.ring_down import RingDown
+from gyrofuse.mismatch.mechanisms.transients.tone_in_spells import ToneInSpells
 from gyrofuse.mismatch.mechanisms.values.angle_quantization import AngleQuantization
 from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
@@ -376,6 +378,19 @@ def _(setting: Setting) -> Drawn:
         math.sin(phase) * size.expand(n_knots, -1),
     )
     return Drawn(effect, {"start": float(time[0]), "stop": float(time[-1])} | setting.of_each("amplitude", size))
+
+
+@draws(ChannelTone)
+def _(setting: Setting) -> Drawn:
+    n, held = setting.n_samples, 60  # samples
+    command = setting.normal(1, n // held + 1).sigmoid().repeat_interleave(held, -1)[:, :n]
+    offset, slope, middle = setting.even(0.05, 0.1) * RATE, setting.even(0.15, 0.3) * RATE, float(command.median())
+    size, phase = setting.sizes(0.35, 0.5)[None] * setting.size, setting.even(0.0, 2 * math.pi)
+    line = ChannelLine(
+        "motor", 0, False, offset, slope, 0.0, 0.0, middle, False, 0, math.cos(phase) * size, math.sin(phase) * size
+    )
+    truth = {"frequency": line.middle_hz, "slope": slope} | setting.of_each("amplitude", size[0])
+    return Drawn(ChannelTone((line,)), truth, {"motor": command})
 
 
 @draws(ToneInSpells)

@@ -16,7 +16,7 @@ from scipy import signal
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse.mismatch.detectors.lines.moving_lines import MovingLine, moving_line
+from gyrofuse.mismatch.detectors.moving.moving_lines import MovingLine, moving_line
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
 from gyrofuse.mismatch.selection.residue import is_left_of_form

@@ -10,7 +10,7 @@ from mismatch_draws import normal
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse.mismatch.mechanisms.regimes.pulses import Pulses
+from gyrofuse.mismatch.mechanisms.transients.pulses import Pulses
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 
 N, RATE = 16_384, 100.0

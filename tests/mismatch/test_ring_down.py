@@ -16,7 +16,7 @@ import gyrofuse as gf
 from gyrofuse.mismatch.detectors.lines.ring_cells import p_value_beside
 from gyrofuse.mismatch.detectors.lines.ring_downs import ring_down_test, scanned_ring_downs
 from gyrofuse.mismatch.likelihoods.damped_tone import DampedTone, Surroundings
-from gyrofuse.mismatch.mechanisms.regimes.ring_down import RingDown
+from gyrofuse.mismatch.mechanisms.transients.ring_down import RingDown
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.stats.multiplicity import p_value_beyond_largest
 

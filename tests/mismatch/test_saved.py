@@ -18,14 +18,10 @@ import gyrofuse as gf
 from gyrofuse.mismatch.mechanisms.catalogue import CATALOGUE
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.mechanisms.regimes.channel_noise import ChannelNoise
-from gyrofuse.mismatch.mechanisms.regimes.chirp import Chirp
 from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
-from gyrofuse.mismatch.mechanisms.regimes.pulses import Pulses
-from gyrofuse.mismatch.mechanisms.regimes.ring_down import RingDown
 from gyrofuse.mismatch.mechanisms.regimes.scale_mixture import ScaleMixture
 from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
 from gyrofuse.mismatch.mechanisms.regimes.telegraph import RandomTelegraph
-from gyrofuse.mismatch.mechanisms.regimes.tone_in_spells import ToneInSpells
 from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
 from gyrofuse.mismatch.mechanisms.remainders.coherence import CoherenceRemainder
 from gyrofuse.mismatch.mechanisms.remainders.slow import SlowRemainder
@@ -68,6 +64,12 @@ from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.moved_low_pass import MovedLowPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.notch import NotchFilter
 from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
+from gyrofuse.mismatch.mechanisms.transients.channel_line import ChannelLine
+from gyrofuse.mismatch.mechanisms.transients.channel_tone import ChannelTone
+from gyrofuse.mismatch.mechanisms.transients.chirp import Chirp
+from gyrofuse.mismatch.mechanisms.transients.pulses import Pulses
+from gyrofuse.mismatch.mechanisms.transients.ring_down import RingDown
+from gyrofuse.mismatch.mechanisms.transients.tone_in_spells import ToneInSpells
 from gyrofuse.mismatch.mechanisms.values.angle_quantization import AngleQuantization
 from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
@@ -145,6 +147,24 @@ EVERY = (
     ChannelNoise("motor", 0, "size", numbers(0.1, 1 / 3), 1.0, numbers(1.1, 1.0), numbers(7 / 3, 1.0), 1.5),
     ChannelCoupling("motor", torch.tensor([[1 / 3], [0.0]], dtype=torch.float64)),
     BiasOscillation(numbers(1 / 3, 0.0), torch.zeros(2, 4, dtype=torch.float64), numbers(0.2, 0.0), 20 / 3),
+    ChannelTone(
+        (
+            ChannelLine(
+                "motor",
+                0,
+                True,
+                4 / 3,
+                10 / 3,
+                0.1,
+                1 / 30,
+                1 / 7,
+                True,
+                2,
+                torch.tensor([[1 / 3, 0.0], [0.1, 0.2]], dtype=torch.float64),
+                torch.tensor([[0.1, 0.0], [1 / 7, 0.2]], dtype=torch.float64),
+            ),
+        )
+    ),
     Chirp(
         numbers(0.5, 20 / 3),
         numbers(4.5, 9.0),

@@ -10,8 +10,8 @@ from mismatch_draws import normal
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse.mismatch.mechanisms.regimes.tone_in_spells import ToneInSpells
 from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
+from gyrofuse.mismatch.mechanisms.transients.tone_in_spells import ToneInSpells
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 
 N, RATE, F = 16384, 200.0, 26.0

@@ -8,9 +8,9 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from gyrofuse.mismatch.detectors.lines import track_fit, tracks
-from gyrofuse.mismatch.detectors.lines.chirps import chirp_test
-from gyrofuse.mismatch.mechanisms.regimes.chirp import Chirp
+from gyrofuse.mismatch.detectors.moving import track_fit, tracks
+from gyrofuse.mismatch.detectors.moving.chirps import chirp_test
+from gyrofuse.mismatch.mechanisms.transients.chirp import Chirp
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 
 

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from gyrofuse._base.results import readable
 from gyrofuse.mismatch.detectors.lines.clocks import clock_test
 from gyrofuse.mismatch.detectors.lines.interleaving import interleaving_test
-from gyrofuse.mismatch.detectors.lines.moving_lines import moving_line_test
 from gyrofuse.mismatch.detectors.lines.ring_downs import ring_down_test
+from gyrofuse.mismatch.detectors.moving.channel_tracks import moving_test
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.detectors.slow.channels import channel_test
 from gyrofuse.mismatch.detectors.slow.hysteresis import hysteresis_test
@@ -34,7 +34,7 @@ TESTS: tuple[Callable[[Comparison], TestResult], ...] = (
     line_gain_test,
     line_test,
     interleaving_test,
-    moving_line_test,
+    moving_test,
     clock_test,
     ring_down_test,
     pulse_test,

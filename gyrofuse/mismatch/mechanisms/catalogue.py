@@ -11,14 +11,10 @@ from collections.abc import Iterable
 
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.mechanisms.regimes.channel_noise import ChannelNoise
-from gyrofuse.mismatch.mechanisms.regimes.chirp import Chirp
 from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
-from gyrofuse.mismatch.mechanisms.regimes.pulses import Pulses
-from gyrofuse.mismatch.mechanisms.regimes.ring_down import RingDown
 from gyrofuse.mismatch.mechanisms.regimes.scale_mixture import ScaleMixture
 from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
 from gyrofuse.mismatch.mechanisms.regimes.telegraph import RandomTelegraph
-from gyrofuse.mismatch.mechanisms.regimes.tone_in_spells import ToneInSpells
 from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
 from gyrofuse.mismatch.mechanisms.remainders.coherence import CoherenceRemainder
 from gyrofuse.mismatch.mechanisms.remainders.slow import SlowRemainder
@@ -60,6 +56,11 @@ from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.moved_low_pass import MovedLowPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.notch import NotchFilter
 from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
+from gyrofuse.mismatch.mechanisms.transients.channel_tone import ChannelTone
+from gyrofuse.mismatch.mechanisms.transients.chirp import Chirp
+from gyrofuse.mismatch.mechanisms.transients.pulses import Pulses
+from gyrofuse.mismatch.mechanisms.transients.ring_down import RingDown
+from gyrofuse.mismatch.mechanisms.transients.tone_in_spells import ToneInSpells
 from gyrofuse.mismatch.mechanisms.values.angle_quantization import AngleQuantization
 from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
@@ -88,6 +89,7 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (ClockSkew, TimeScale),
     (GSensitivity, QuadraticCoupling, ScaleFactor, DriftingScale, ChannelCoupling, ChannelTransfer),
     (Motion,),  # whose smooth course looks like any of these
+    (ChannelTone,),  # a cause that is logged
     (Chirp,),  # which passes any frequency
     (RingDown, Pulses),  # whose strongest are lines too
     (WanderingHarmonics,),  # each of whose lines alone looks like several tones, or like noise that changes

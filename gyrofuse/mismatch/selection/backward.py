@@ -189,8 +189,11 @@ def _pruned(
 def _left_out(one: Selected, later: Sequence[Finding], generator: torch.Generator) -> tuple[HeldOutScore, Comparison]:
     """Score of a finding where all others are in, and that comparison.
 
-    What the converter does is judged on the numbers as they came: whatever is taken off them hides it.
+    What the converter does is judged on the numbers as they came: whatever is taken off them hides it. So is what
+    follows a channel beside lines without a cause, whose repair takes all that is in their band.
     """
+    if one.finding.channel is not None:
+        later = [f for f in later if not f.effect.additive or f.effect.line_width(f.parameters, one.before) is None]
     if one.finding.effect.stage or not later:
         return one.score, one.before
     left = repaired(one.before, later, generator)

@@ -18,13 +18,13 @@ from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.known_path import KnownPath
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
-from gyrofuse.mismatch.mechanisms.not_identifiable import NOT_IDENTIFIABLE
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.signals.folds import estimation_samples, signal_gains
 from gyrofuse.mismatch.stats.inclusion import included_sensors
 from gyrofuse.mismatch.stats.limits import Z
 
+NOT_IDENTIFIABLE = "not_identifiable"  # what is seen but has no name: several mechanisms explain it equally well
 _OF_ONE_BAND = 0.9  # share of the evidence from which a gain might be a line's alone
 _WHOLE = ("each", "length")  # kinds of rows that are made from all of a channel
 _LATE = 0.25  # share of the evidence a quarter of a cycle late, from which it is no instantaneous coupling
@@ -231,3 +231,22 @@ def _size(fit: ChannelFit, sensor: int, unit: str, factor: float) -> Parameter:
     direction = gains / max(abs(size), 1e-300)
     reach = Z * math.sqrt(float(direction @ covariance @ direction))
     return Parameter(size, size - reach if len(gains) == 1 else max(size - reach, 0.0), size + reach, unit)
+
+
+def not_identifiable(finding: Finding, seen: str) -> Finding:
+    """The finding without its name, which is one among its alternatives, where the data cannot prefer any.
+
+    The effect stays, since the rivals have the same: the repair does not depend on the name.
+
+    Args:
+        finding: With alternatives.
+        seen: What is there whatever its name, the beginning of a sentence.
+    """
+    rivals = (finding.mechanism, *finding.alternatives)
+    words = ", ".join(map(readable, rivals[:-1]))
+    return replace(
+        finding,
+        mechanism=NOT_IDENTIFIABLE,
+        alternatives=rivals,
+        sentence=f"{seen}; {words} and {readable(rivals[-1])} explain it equally well",
+    )

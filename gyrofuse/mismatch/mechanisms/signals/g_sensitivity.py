@@ -7,8 +7,7 @@ from typing import ClassVar
 
 from gyrofuse.mismatch.detectors.slow.channels import accelerations
 from gyrofuse.mismatch.mechanisms.mechanism import Finding
-from gyrofuse.mismatch.mechanisms.not_identifiable import not_identifiable
-from gyrofuse.mismatch.mechanisms.signals.channel_gain import ChannelGain, gain_in_g, gravity_unit
+from gyrofuse.mismatch.mechanisms.signals.channel_gain import ChannelGain, gain_in_g, gravity_unit, not_identifiable
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 
 _DOUBTFUL = 1.0  # deg/s/g, five times that of the poorest gyroscopes: what accelerates the board may turn it as well

@@ -14,7 +14,7 @@ from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.detectors.variance.handling import handled
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
-from gyrofuse.mismatch.mechanisms.regimes.transient import Transient, held_out_sums, in_fours, kept_of
+from gyrofuse.mismatch.mechanisms.transients.transient import Transient, held_out_sums, in_fours, kept_of
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import Dims
 

@@ -12,7 +12,7 @@ from scipy import stats
 from torch import Tensor
 
 from gyrofuse.mismatch.decisions import CERTAIN, NATS_AS_GOOD, NATS_PER_NUMBER, NEW_TERM_NATS
-from gyrofuse.mismatch.detectors.lines.chirps import swept
+from gyrofuse.mismatch.detectors.moving.chirps import swept
 from gyrofuse.mismatch.detectors.slow.hysteresis import strongest_relay
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.detectors.spectra.peak_fit import Oscillation, oscillation_of

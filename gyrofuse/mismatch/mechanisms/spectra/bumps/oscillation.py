@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.detectors.lines.chirps import swept
+from gyrofuse.mismatch.detectors.moving.chirps import swept
 from gyrofuse.mismatch.detectors.spectra.band_tests import excess_p_value, level_of
 from gyrofuse.mismatch.detectors.spectra.peak_fit import Oscillation, oscillation_of
 from gyrofuse.mismatch.detectors.spectra.peaks import Stretch

@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.decisions import NATS_AS_GOOD, NATS_PER_NUMBER
-from gyrofuse.mismatch.detectors.lines.moving_lines import moving_line
 from gyrofuse.mismatch.detectors.lines.ring_downs import ring_down_p_value, ring_downs, scanned_ring_downs
+from gyrofuse.mismatch.detectors.moving.moving_lines import moving_line
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.likelihoods.damped_tone import DampedTone, FittedTone, Surroundings
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
-from gyrofuse.mismatch.mechanisms.regimes.transient import Transient, hourly, often_words
+from gyrofuse.mismatch.mechanisms.transients.transient import Transient, hourly, often_words
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.signals.folds import N_FOLDS

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.decisions import CHANCE
-from gyrofuse.mismatch.detectors.lines.tracks import Sweep, strongest_sweep
+from gyrofuse.mismatch.detectors.moving.tracks import Sweep, strongest_sweep
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.likelihoods.spectra.coherence import decorrelated

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.transforms import squared_modulus
-from gyrofuse.mismatch.detectors.lines.track_fit import AROUND, Candidates, fitted_track
+from gyrofuse.mismatch.detectors.moving.track_fit import AROUND, Candidates, fitted_track
 from gyrofuse.mismatch.signals.lines import sets_of
 from gyrofuse.mismatch.stats.multiplicity import sidak
 

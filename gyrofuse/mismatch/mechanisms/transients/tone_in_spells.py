@@ -15,8 +15,8 @@ from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.detectors.spectra.peaks import strongest_peak
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
-from gyrofuse.mismatch.mechanisms.regimes.transient import Transient, kept_of
 from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
+from gyrofuse.mismatch.mechanisms.transients.transient import Transient, kept_of
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.dims import Dims

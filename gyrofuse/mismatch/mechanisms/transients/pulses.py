@@ -18,7 +18,7 @@ from gyrofuse.mismatch.likelihoods.damped_tone import Surroundings
 from gyrofuse.mismatch.likelihoods.pulse import FittedPulse, Pulse, fitted_pulse, other_course, sized, width_limits
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
-from gyrofuse.mismatch.mechanisms.regimes.transient import Transient, hourly, often_words
+from gyrofuse.mismatch.mechanisms.transients.transient import Transient, hourly, often_words
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.signals.folds import N_FOLDS

@@ -11,11 +11,12 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.decisions import NATS_PER_NUMBER
-from gyrofuse.mismatch.detectors.lines.moving_lines import MovingLine, moving_line, moving_line_p_value, straight_line
+from gyrofuse.mismatch.detectors.moving.moving_lines import MovingLine, moving_line, moving_line_p_value, straight_line
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
-from gyrofuse.mismatch.mechanisms.regimes.transient import Transient, kept_of
+from gyrofuse.mismatch.mechanisms.transients.carrier import Carrier
+from gyrofuse.mismatch.mechanisms.transients.transient import Transient, kept_of
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.signals.lines import whitened
@@ -139,30 +140,10 @@ class Chirp(Transient):
 
     def _fitted(self, comparison: Comparison, keep: Tensor | None = None) -> Chirp:
         """With the amplitudes of the samples to keep `(time,)`, by default of all, of one source."""
-        gram, seen = self._normal_equations(comparison, keep)
-        amplitude = torch.linalg.solve(gram.to(seen.dtype), seen)  # (knot, sensor)
-        if comparison.n_sensors > 1:
-            scale = self._noise(comparison).sqrt()
-            u, s, v = torch.linalg.svd(amplitude / scale, full_matrices=False)
-            amplitude = s[0] * u[:, :1] * v[:1] * scale
+        signal = comparison.recording - comparison.recording.mean(-1, keepdim=True)
+        carrier = self._carrier(comparison.n_samples, comparison.info.rate)
+        amplitude = carrier.amplitudes(signal, self._noise(comparison).sqrt(), keep)
         return replace(self, cosine=amplitude.real, sine=-amplitude.imag)
-
-    def _normal_equations(self, comparison: Comparison, keep: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Of the amplitudes at the knots, `(knot, knot)` and `(knot, sensor)`."""
-        first, inside, weights, turn = self._basis(comparison.n_samples, comparison.info.rate)
-        here = slice(first, first + len(turn))
-        signal = comparison.recording[:, here] - comparison.recording.mean(-1, keepdim=True)
-        kept = torch.ones(len(turn), dtype=torch.float64) if keep is None else keep[here].to(torch.float64)
-        k = len(self.time_s)
-        gram = torch.zeros(k, k, dtype=torch.float64)
-        seen = torch.zeros(k, comparison.n_sensors, dtype=torch.complex128)
-        turned = 2 * (signal * kept * turn.conj()).mT  # (time, sensor)
-        for side, weight in enumerate(weights):
-            seen.index_add_(0, inside + side, weight[:, None] * turned)
-            for other, its in enumerate(weights):
-                gram.index_put_((inside + side, inside + other), weight * its * kept, accumulate=True)
-        gram += 1e-2 * gram.diagonal().max() * torch.eye(k, dtype=torch.float64)  # a knot beyond the record has nothing
-        return gram, seen
 
     def _beyond_noise(self, comparison: Comparison) -> float:
         """Factor of the amplitude that is not what noise makes of one course at so many knots."""
@@ -172,8 +153,7 @@ class Chirp(Transient):
 
     def _by_noise(self, comparison: Comparison) -> Tensor:
         """Squared amplitude that noise makes of one course at each knot, in units of its density, `(knot,)`."""
-        gram, _ = self._normal_equations(comparison)
-        return 4 * torch.linalg.inv(gram).diagonal()
+        return self._carrier(comparison.n_samples, comparison.info.rate).by_noise()
 
     def _shrunk(self, comparison: Comparison, there: Tensor) -> Chirp:
         """In some sensors `(sensor,)`, and by as much smaller as noise has a share of the power of its amplitudes."""
@@ -213,8 +193,8 @@ class Chirp(Transient):
         """Root mean square of the amplitude, `(sensor,)`."""
         return (self.cosine.square() + self.sine.square()).mean(0).sqrt()
 
-    def _basis(self, n_samples: int, rate: float) -> tuple[int, Tensor, tuple[Tensor, Tensor], Tensor]:
-        """First sample of the course, and for each of its samples the knot before it, weights of both, and the turn."""
+    def _carrier(self, n_samples: int, rate: float) -> Carrier:
+        """Its phase, and its knots."""
         first = max(math.ceil(float(self.time_s[0]) * rate - 1e-6), 0)
         last = min(math.floor(float(self.time_s[-1]) * rate + 1e-6), n_samples - 1)
         t = torch.arange(first, max(last + 1, first), dtype=torch.float64) / rate
@@ -227,16 +207,11 @@ class Chirp(Transient):
             ((self.frequency_hz[1:] + self.frequency_hz[:-1]) / 2 * step).cumsum(0), (1, 0)
         )
         angle = 2 * math.pi * (cycles[inside] + after * (self.frequency_hz[inside] + rise[inside] * share / 2))
-        return first, inside, (1 - share, share), torch.polar(torch.ones_like(angle), angle)
+        return Carrier(first, inside, (1 - share, share), torch.polar(torch.ones_like(angle), angle), len(self.time_s))
 
     def _path(self, n_samples: int, rate: float, turned: float) -> Tensor:
-        first, inside, (before, after), turn = self._basis(n_samples, rate)
-        amplitude = torch.complex(self.cosine, -self.sine)
-        here = before[:, None] * amplitude[inside] + after[:, None] * amplitude[inside + 1]
-        path = torch.zeros(self.cosine.shape[-1], n_samples, dtype=torch.float64)
-        carrier = turn * complex(math.cos(turned), math.sin(turned))
-        path[:, first : first + len(turn)] = (here * carrier[:, None]).real.mT
-        return path
+        amplitude = torch.complex(self.cosine, -self.sine) * complex(math.cos(turned), math.sin(turned))
+        return self._carrier(n_samples, rate).path(amplitude, n_samples)
 
     def path(self, n_samples: int, rate: float) -> Tensor:
         return self._path(n_samples, rate, 0.0)

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.transforms import squared_modulus
-from gyrofuse.mismatch.detectors.lines.chirps import chirp_test, decorrelated_record, strongest_chirp
+from gyrofuse.mismatch.detectors.moving.chirps import chirp_test, decorrelated_record, strongest_chirp
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.signals.comparison import Comparison
@@ -105,7 +105,7 @@ def moving_line(side: Records) -> MovingLine:
             continue
         power = _powers(white, length)
         gains, ratios = _cell_ratios(power)
-        log_ratios = _forward(ratios)
+        log_ratios = over_paths(ratios)
         scales.append((log_ratios, length, gains))
     if not scales:
         return MovingLine(-math.inf, n, torch.full((1,), math.nan, dtype=torch.float64))
@@ -141,7 +141,7 @@ def _cell_ratios(power: Tensor) -> tuple[Tensor, Tensor]:
     return gains, gains.clamp(max=600.0).exp()
 
 
-def _forward(ratios: Tensor) -> Tensor:
+def over_paths(ratios: Tensor) -> Tensor:
     """Logarithm of the mean over all paths, `(set * power,)`, of likelihood ratios `(set, power, segment, bin)`."""
     cells = ratios.flatten(0, 1).movedim(1, 0)  # (segment, set, bin)
     count, rows, bins = cells.shape
