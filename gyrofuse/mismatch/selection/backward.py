@@ -149,12 +149,13 @@ def _renamed(
     selected: list[Selected], lost: list[int], names: set[str], level: float, generator: torch.Generator
 ) -> tuple[list[Selected], Comparison]:
     """The findings without those that lost, and with what is found under some names instead."""
-    first = lost[0]
+    first, selected_before = lost[0], selected
     kept = [one.finding for k, one in enumerate(selected) if k > first and k not in lost]
     selected, comparison = _repaired(selected[:first], kept, selected[first].before, generator)
-    kinds = named(names)
+    kinds, beaten = named(names), tuple(sorted({selected_before[k].finding.mechanism for k in lost}))
     for _ in lost:
-        found = [f for kind in kinds if (f := kind.detect_and_fit(comparison, level)) is not None]
+        beside = replace(comparison, passed_over=beaten)
+        found = [f for kind in kinds if (f := kind.detect_and_fit(beside, level)) is not None]
         for finding in sorted(found, key=lambda f: -f.gain):
             if score_held_out(comparison, finding.effect).confirms(finding.p_value):
                 selected, comparison = _repaired(selected, [finding], comparison, generator)

@@ -109,7 +109,14 @@ def _best_of_stage(
             score = _held_in_company(finding, start, comparison, generator)
         if score is not None:
             return Selected(replace(finding, held_out_gain=score.total), comparison, score)
-    return None
+    failed = sorted({f.mechanism for f in found if f.effect.of_spectra} - {*comparison.passed_over})
+    if not failed:
+        return None
+    # What is fitted beside what does not hold may well do.
+    spectral = tuple(kind for kind in stage if kind.of_spectra)
+    beside = replace(comparison, passed_over=(*comparison.passed_over, *failed))
+    again = _best_of_stage(spectral, selected, start, beside, level, generator)
+    return None if again is None else again._replace(before=comparison)
 
 
 def _held(

@@ -12,6 +12,7 @@ from torch import Tensor
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.signals.comparison import N_BLOCKS, Comparison
 from gyrofuse.mismatch.signals.derived import derived
+from gyrofuse.mismatch.signals.folds import N_JUDGED
 from gyrofuse.mismatch.signals.known_lines import line_parts
 from gyrofuse.mismatch.stats.long_run_variance import long_run_variance
 from gyrofuse.mismatch.stats.multiplicity import sidak
@@ -43,14 +44,18 @@ class LineGains(NamedTuple):
 
 @derived
 def line_gains(comparison: Comparison) -> LineGains | None:
-    """Those of the row that they follow most closely; None without a channel, or without lines of a cycle a block.
+    """Those of the row that they follow most closely; None without a channel, or without lines of two cycles a block.
 
-    Slopes by least squares; what is left may wander by itself, which the long-run variance of the products allows for.
+    Blocks are 256, or fewer for lines so slow that these would not have two cycles. Slopes by least squares; what is
+    left may wander by itself, which the long-run variance of the products allows for.
     """
     lines = comparison.reference.lines
-    block = comparison.block
     cycles, apart = 2.05, 4  # cycles of a line in a block (two are the taper's width), and its bins to its neighbours
-    usable = [f for f in lines if f * block > cycles and (0.5 - f) * block > cycles]
+    n_blocks, block, usable = 2 * N_BLOCKS, 0, list[float]()
+    while not usable and n_blocks > N_JUDGED:
+        n_blocks //= 2
+        block = comparison.n_samples // n_blocks
+        usable = [f for f in lines if f * block > cycles and (0.5 - f) * block > cycles]
     info = comparison.info
     rows = [(name, k, row) for name in info.channels for k, row in enumerate(info.channel_rows(name))]
     if not usable or not rows:
@@ -59,15 +64,15 @@ def line_gains(comparison: Comparison) -> LineGains | None:
     density = comparison.base.spectrum(torch.tensor(usable, dtype=torch.float64))
     clear = (whole.abs().square() / density).sum(0)
     best = int(clear.argmax())
-    f, n = usable[best], block * N_BLOCKS
+    f, n = usable[best], block * n_blocks
     if any(abs(f - other) * block < apart for other in lines if other != f):
         return None
-    sizes, sd = _sizes(comparison.recording[:, :n], f, density[:, best])
+    sizes, sd = _sizes(comparison.recording[:, :n].unflatten(-1, (n_blocks, block)), f, density[:, best])
     if float(sd.min()) > 1.0:  # of the size: a line that no block shows follows nothing
         return None
     found = []
     for name, k, row in rows:
-        course = row[:n].unflatten(-1, (N_BLOCKS, block)).mean(-1)
+        course = row[:n].unflatten(-1, (n_blocks, block)).mean(-1)
         course = course - course.mean()
         spread = float(course.square().sum())
         if not bool(course.isfinite().all()) or spread == 0:
@@ -76,7 +81,7 @@ def line_gains(comparison: Comparison) -> LineGains | None:
         left = (sizes - 1 - slope[:, None] * course) * course
         scatter = [long_run_variance(one[None]) for one in left]
         dof = min(one.dof for one in scatter)
-        variance = torch.tensor([one.value for one in scatter], dtype=torch.float64) * N_BLOCKS
+        variance = torch.tensor([one.value for one in scatter], dtype=torch.float64) * n_blocks
         slope_sd = variance.maximum(spread * sd.square()).sqrt() / spread
         p = torch.from_numpy(2 * stats.t.sf((slope.abs() / slope_sd).numpy(), dof))
         found.append(LineGains(name, k, sizes, sd, course, slope, slope_sd, p))
@@ -102,17 +107,17 @@ def line_gain_test(comparison: Comparison) -> TestResult:
     )
 
 
-def _sizes(signal: Tensor, f: float, density: Tensor) -> tuple[Tensor, Tensor]:
-    """Sizes of a line in blocks in its mean phase, over their mean, `(sensor, block)`, and their sd by noise."""
-    block = signal.shape[-1] // N_BLOCKS
-    t = torch.arange(signal.shape[-1], dtype=torch.float64)
-    taper = torch.hann_window(block, periodic=True, dtype=torch.float64)
-    basis = torch.polar(torch.ones_like(t), -2 * math.pi * f * t).unflatten(-1, (N_BLOCKS, block)) * taper
-    parts = 2 * (signal.unflatten(-1, (N_BLOCKS, block)) * basis).sum(-1) / taper.sum()
+def _sizes(blocks: Tensor, f: float, density: Tensor) -> tuple[Tensor, Tensor]:
+    """Sizes of a line in blocks `(sensor, block, time)` in its mean phase, over their mean, and their sd by noise."""
+    count, length = blocks.shape[-2:]
+    t = torch.arange(count * length, dtype=torch.float64).view(count, length)
+    taper = torch.hann_window(length, periodic=True, dtype=torch.float64)
+    basis = torch.polar(torch.ones_like(t), -2 * math.pi * f * t) * taper
+    parts = 2 * (blocks * basis).sum(-1) / taper.sum()
     # A line that is known to a bin turns a little on the way: by a 16th of a cycle, or fewer, once that is undone.
-    padded = 8 * N_BLOCKS
+    padded = 8 * count
     cycles = torch.fft.fft(parts, n=padded).abs().square().sum(0).argmax()
-    turn = -2 * math.pi * cycles * torch.arange(N_BLOCKS, dtype=torch.float64) / padded
+    turn = -2 * math.pi * cycles * torch.arange(count, dtype=torch.float64) / padded
     parts = parts * torch.polar(torch.ones_like(turn), turn)
     mean = parts.mean(-1, keepdim=True)
     sizes = (parts * mean.conj()).real / mean.abs().square()

@@ -14,7 +14,7 @@ from gyrofuse.mismatch.detectors.slow.line_gains import LineGains, line_gains
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
 from gyrofuse.mismatch.mechanisms.signals.scale_factor import ScaleFactor
-from gyrofuse.mismatch.signals.comparison import N_BLOCKS, Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED, in_fold
 from gyrofuse.mismatch.signals.known_lines import line_parts
@@ -80,7 +80,7 @@ class DriftingScale(Mechanism):
         gains = line_gains(comparison)
         if gains is None or (gains.channel, gains.row) != (self.channel, self.row):
             return self
-        kept = ~in_fold(N_JUDGED, fold).repeat_interleave(N_BLOCKS // N_JUDGED)
+        kept = ~in_fold(N_JUDGED, fold).repeat_interleave(gains.sizes.shape[-1] // N_JUDGED)
         course = torch.where(kept, gains.course, 0.0)
         slope = (gains.sizes - 1) @ course / course.square().sum()
         return replace(self, slope=torch.where(self.slope != 0, slope, 0.0))

@@ -170,8 +170,8 @@ def leading_shape(comparison: Comparison) -> Shape | None:
     seen = [_with_sd(comparison, chosen, i) for i in range(len(chosen.terms))]
     seen = [(term, (local * wider, shared * wider.max())) for term, (local, shared) in seen]
     found = [_found_before(term, data, comparison) for term, _ in seen]
-    first, gain, alone = _first(data, chosen, [term for term, _ in seen], found)
-    if found[first]:
+    first, gain, alone = _first(data, chosen, [term for term, _ in seen], found, comparison.passed_over)
+    if found[first] or chosen.terms[first].name in comparison.passed_over:
         return None
     term, others = chosen.terms[first], _others(chosen, first)
     n_classes = 16.0  # classes and frequencies that compete
@@ -235,25 +235,27 @@ def _found_before(term: Term, data: Ratios, comparison: Comparison) -> bool:
     return False
 
 
-def _first(data: Ratios, chosen: Fit, terms: list[Term], found_before: list[bool]) -> tuple[int, float, bool]:
+def _first(
+    data: Ratios, chosen: Fit, terms: list[Term], found_before: list[bool], passed_over: Sequence[str]
+) -> tuple[int, float, bool]:
     """The term that acts first, what it adds to the log likelihood of the others, nats, and whether they add little.
 
     Not one that gains nothing by itself unless others need it, nor the little that was left for beside a common source
     or a mode, or, less yet, beside a filter. Where one mends the form of a filter that was found before, what is added
-    may as well: other filters come first.
+    may as well: other filters come first. So do others than those that do not hold.
     """
     losses, next_to_nothing = [chosen.gain], 0.01
     if len(terms) > 1:
         losses = [chosen.gain - max(fit(data, _others(chosen, i)).gain, 0.0) for i in range(len(terms))]
     most = max(range(len(terms)), key=lambda i: losses[i])
 
-    def rank(i: int) -> tuple[bool, bool, int, float]:
+    def rank(i: int) -> tuple[bool, bool, bool, int, float]:
         mends = found_before[i] or (any(found_before) and terms[i].acts != "filter")
         alone = float(log_gain(data, data_model(data, [terms[i]])).sum())
         faint = losses[i] < losses[most] * (next_to_nothing if terms[most].acts == "filter" else 0.1)
         needed = losses[i] > losses[most] / 10
         idle = faint or (alone < NEW_TERM_NATS and not needed)
-        return idle, mends, _ORDER.index(terms[i].acts), -alone
+        return terms[i].name in passed_over, idle, mends, _ORDER.index(terms[i].acts), -alone
 
     first = min(range(len(terms)), key=rank)
     alone = all(losses[i] < next_to_nothing * losses[first] for i in range(len(terms)) if i != first)
