@@ -81,6 +81,17 @@ def test_a_filter_of_another_corner_than_the_simulations(
     assert report.held_out.after < 1.5
 
 
+def test_a_filter_of_another_corner_beside_a_sensor_without_one() -> None:
+    """The sensor without says nothing of the simulation's filter."""
+    sides = [noise(105 + k) for k in (0, 1)]
+    for side, corner in zip(sides, (40.0, 25.0), strict=True):
+        side[1:] = low_passed(side[1:], 2, corner)
+    (finding,) = diagnosed(*sides).findings
+    assert (finding.mechanism, finding.sensors) == ("low_pass", (1, 2))
+    assert all(holds(finding, f"corner[{i}]", 40.0, 0.03) for i in (1, 2))
+    assert holds(finding, "simulated_corner", 25.0, 0.03)
+
+
 @pytest.mark.parametrize(
     ("recorded", "simulated"),
     [

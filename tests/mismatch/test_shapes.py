@@ -502,6 +502,17 @@ def test_shapes_are_searched_once_for_a_case():
     assert leading_shape(given) is leading_shape(given)
 
 
+def test_what_a_shape_is_fitted_beside_comes_first_where_it_was_passed_over():
+    given = drawn(22, lambda x, g: CHANGES["filter"][1](CHANGES["white in common"][1](x, g), g))
+    first = leading_shape(given)
+    assert first is not None
+    assert [term.name for term in (first.term, *first.company)] == ["low_pass", "common_mode"]
+    second = leading_shape(replace(given, passed_over=("low_pass",)))
+    assert second is not None
+    assert second.term.name == "common_mode"
+    assert leading_shape(replace(given, passed_over=("low_pass", "common_mode"))) is None
+
+
 @pytest.mark.parametrize(("share", "regular"), [(0.0, True), (0.9, True), (0.999, False)])
 def test_sensors_keep_something_of_their_own_beside_what_is_common(share: float, regular: bool):
     """Cross-spectra of fewer ordinates than sensors lie in a plane: noise in it alone would be infinitely likely."""

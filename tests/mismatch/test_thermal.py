@@ -92,9 +92,10 @@ def test_steps_and_ramps_stay_what_they_are(name: str, course: np.ndarray) -> No
     assert [f.mechanism for f in found] == [name]
 
 
-def test_a_scale_factor_that_follows_temperature_is_seen_in_what_moves_the_device() -> None:
+@pytest.mark.parametrize("f", [3.1, 0.9])  # of the slow one 256 blocks would have a cycle each
+def test_a_scale_factor_that_follows_temperature_is_seen_in_what_moves_the_device(f: float) -> None:
     temperature = 25 + 15 * T / T[-1]
-    swing = 3 * np.sin(2 * np.pi * 3.1 * T)
+    swing = 3 * np.sin(2 * np.pi * f * T)
     slope = np.array([[0.02], [0.0], [-0.01]])
     recording = gf.Recording(
         torch.from_numpy(noise(41) + swing * (1 + slope * (temperature - 32.5))),

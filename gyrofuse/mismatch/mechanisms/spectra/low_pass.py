@@ -58,7 +58,7 @@ class LowPassFilter(Filter):
         if LowPass not in there:
             likeliest = 3  # forms
             yield from filter_starts(data, company)[:likeliest]
-        if SimulatedLowPass not in there and falls(data):
+        if SimulatedLowPass not in there and bool(falls(data).any()):
             yield from filter_starts(data, company, SimulatedLowPass)[:1]
 
     @classmethod
@@ -140,11 +140,11 @@ def filter_starts(data: Ratios, company: Sequence[Term], form: type[LowPass] = L
     return [start for start in found if isinstance(start, LowPass)]
 
 
-def falls(data: Ratios) -> bool:
-    """Whether the simulation's noise falls towards half the rate in some sensor, more than an AR1 does."""
+def falls(data: Ratios) -> Tensor:
+    """Whether the simulation's noise falls towards half the rate, more than an AR1 does, `(sensor,)`."""
     least = 0.4  # power at 0.48 over that at 0.24 of the rate: of an AR1 0.47
     middle, high = (data.power[int((data.ground.bands.frequency - f).abs().argmin())] for f in (0.24, 0.48))
-    return bool((high < least * middle).any())
+    return high < least * middle
 
 
 def strengths(term: LowPass) -> Tensor:

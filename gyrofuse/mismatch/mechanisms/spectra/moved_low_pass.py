@@ -106,7 +106,7 @@ class MovedLowPassFilter(Filter):
 
     @classmethod
     def starts(cls, data: Ratios, company: Sequence[Term]) -> Iterable[Term]:
-        if not falls(data) or any(isinstance(term, LowPass | MovedLowPass) for term in company):
+        if not bool(falls(data).any()) or any(isinstance(term, LowPass | MovedLowPass) for term in company):
             return ()
         return _starts(data, company)[:1]
 
@@ -180,13 +180,14 @@ class MovedLowPassFilter(Filter):
 def _starts(data: Ratios, company: Sequence[Term]) -> list[MovedLowPass]:
     """Every pair of forms, the likeliest first.
 
-    The simulation's filter is the one without which its noise would be the most even in all but the slow bands.
+    The simulation's filter is the one without which its noise would be the most even in all but the slow bands, in the
+    sensors where it falls: others may have none.
     """
     ground = data.ground
-    free = torch.ones(1, data.n_sensors, dtype=torch.bool)
+    free, low = torch.ones(1, data.n_sensors, dtype=torch.bool), falls(data)
     came, slow, faint = data.power * ground.rounded[0], 0.03, 1e-3  # of the most in a band: below it is what leaks
     fast = ground.bands.frequency > slow
-    shown = came[fast].log().mean(-1)
+    shown = came[fast][:, low].log().mean(-1)
     weight = (data.s * data.usable.amax(-1))[fast] * (shown > shown.max() + math.log(faint))
     families: list[Term] = []
     for simulated in _KINDS:
