@@ -163,8 +163,14 @@ class ChannelLine:
         late = f", {1e3 * self.late_s:.3g} ms late" if self.late_s else ""
         what = "it" if self.of_channel else "its frequency"
         grows = ("", f", its size growing as {what}", f", its size growing as the square of {what}")[self.growth]
-        first = f"{self.middle_hz:.4g} Hz at {self.middle:.4g} of it" if self.bend else f"{self.offset_hz:.4g} Hz"
-        return f"{first} and {self.rise:.4g} Hz for each unit{' there' if self.bend else ' of it'}{late}{grows}"
+        nearly = 0.005  # of the frequency
+        if self.bend:
+            law = f"{self.middle_hz:.4g} Hz at {self.middle:.4g} of it and {self.rise:.4g} Hz for each unit there"
+        elif abs(self.offset_hz) < nearly * abs(self.middle_hz):
+            law = f"{self.rise:.4g} Hz for each unit of it"
+        else:
+            law = f"{self.offset_hz:.4g} Hz and {self.rise:.4g} Hz for each unit of it"
+        return f"{law}{late}{grows}"
 
     @property
     def rise(self) -> float:

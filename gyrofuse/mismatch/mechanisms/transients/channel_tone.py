@@ -139,7 +139,9 @@ class ChannelTone(Mechanism):
     def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         courses = [line.frequencies(comparison.info, comparison.n_samples) for line in self.lines]
         low, high = min(float(f.min()) for f in courses), max(float(f.max()) for f in courses)
-        track = (comparison.info.seconds(comparison.n_samples), courses[0]) if fitted else None
+        gap = torch.full((1,), math.nan, dtype=torch.float64)  # between one line and the next
+        seconds = torch.cat([comparison.info.seconds(comparison.n_samples), gap])
+        track = (seconds.repeat(len(courses)), torch.cat([torch.cat([f, gap]) for f in courses])) if fitted else None
         window = 256 / comparison.info.rate
         pictures.spectrogram(ax, comparison, sensor, (low - (high - low) / 4, high + (high - low) / 4), window, track)
 
