@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse.mismatch.detectors.moving.channel_tracks import as_it_moves, channel_track
+from gyrofuse.mismatch.detectors.moving.channel_tracks import as_it_moves, busiest, channel_track
 from gyrofuse.mismatch.mechanisms.transients.carrier import Carrier
 from gyrofuse.mismatch.mechanisms.transients.channel_tone import ChannelTone
 from gyrofuse.mismatch.repair.inputs import prepared
@@ -131,6 +131,16 @@ def test_values_that_a_slower_source_sent_lie_on_straight_lines():
     assert found is not None
     assert isinstance(found.effect, ChannelTone)
     assert found.effect.lines[0].straight
+
+
+def test_of_a_long_record_the_stretch_counts_in_which_the_channel_moves():
+    still = torch.zeros(1000, dtype=torch.float64)
+    still[600:900] = torch.sin(torch.arange(300, dtype=torch.float64))
+    part = busiest([still], 400)
+    assert part.stop - part.start == 400
+    assert part.start <= 600
+    assert part.stop >= 900
+    assert busiest([still], 1000) == slice(0, 1000)
 
 
 @pytest.mark.parametrize("what", ["nothing", "wandering tone", "steady tone", "sag", "louder"])

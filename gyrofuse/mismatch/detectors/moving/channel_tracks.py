@@ -94,18 +94,33 @@ def channel_track(comparison: Comparison) -> ChannelTrack | None:
     rows = given + [(name, k, moved) for name, k, u in given if (moved := as_it_moves(u)) is not u]
     if not rows:
         return None
-    white = decorrelated_record(comparison.observed).to(torch.float32)
-    n, affordable = white.shape[-1], 5e7 / (white.numel() * len(rows))
+    white, many = decorrelated_record(comparison.observed).to(torch.float32), 5e6  # samples of all rows and sensors
+    part = busiest([u for *_, u in rows], max(int(many / (len(white) * len(rows))), 2**15))
+    white, rows = white[:, part], [(name, k, u[part]) for name, k, u in rows]
+    n, affordable = white.shape[-1], 10 * many / (white.numel() * len(rows))
     lengths = [length for length in (64, 128, 256, 512) if length == 64 or length < affordable]
-    scanned = [_scanned(white, name, k, u, length) for length in lengths if n // length >= 16 for name, k, u in rows]
+    scanned = [
+        (_scanned(white, name, k, u, length), u) for length in lengths if n // length >= 16 for name, k, u in rows
+    ]
     if not scanned:
         return None
-    log_ratio = float(torch.tensor([one.log_ratio for one in scanned]).logsumexp(0)) - math.log(len(scanned))
-    best = max(scanned, key=lambda one: one.log_ratio)
+    log_ratio = float(torch.tensor([one.log_ratio for one, _ in scanned]).logsumexp(0)) - math.log(len(scanned))
+    best, u = max(scanned, key=lambda one: one[0].log_ratio)
     plain = 0.01  # p value from which on other paths are asked for
-    if p_value_from_e_value(log_ratio) < plain and not _tells(white, best, best.values(comparison)):
+    if p_value_from_e_value(log_ratio) < plain and not _tells(white, best, u):
         return None
     return best._replace(log_ratio=log_ratio)
+
+
+def busiest(rows: list[Tensor], most: int) -> slice:
+    """All of a record, or of a long one the stretch of so many samples in which rows `(time,)` move most."""
+    n = len(rows[0])
+    if n <= most:
+        return slice(0, n)
+    starts = range(0, n - most + 1, max((n - most) // 8, 1))
+    moves = [sum(float(u[a : a + most].std() / u.std().clamp(min=1e-300)) for u in rows) for a in starts]
+    start = starts[moves.index(max(moves))]
+    return slice(start, start + most)
 
 
 def _scanned(white: Tensor, channel: str, row: int, u: Tensor, length: int) -> ChannelTrack:
