@@ -197,6 +197,7 @@ EVERY = (
     SensorDelay(numbers(0.0, 1 / 3)),
     ToneSize(7.3, numbers(0.3, 1 / 3)),
     RandomTelegraph(numbers(0.3, 0.0), numbers(1 / 3, 1.0), numbers(0.2, 1.0)),
+    RandomTelegraph(numbers(0.3, 0.1), numbers(1 / 3, 1 / 7), numbers(1 / 7, 1 / 3), (1, -1)),
     TemperatureDrift(
         numbers(1 / 3, 0.0), torch.zeros(2, 4, dtype=torch.float64), 0.7, "temperature", 0, (numbers(0.1, 0.0),)
     ),

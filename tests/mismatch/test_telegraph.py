@@ -284,3 +284,34 @@ def test_the_repair_builds_levels_into_every_record() -> None:
     assert bool((made[:, 0] == 0).all())
     assert made[:, 1].abs().unique().tolist() == pytest.approx([half])
     assert not torch.equal(made[0, 1], made[1, 1])
+
+
+def test_sensors_that_jump_at_the_same_times_share_what_is_drawn():
+    g = torch.Generator().manual_seed(80)
+    together, alone = (_path(N, 120.0, 120.0, g) for _ in range(2))
+    noise = NOISE.simulate(N, batch=(4,), generator=g)
+    jumps = torch.stack([together, -together, torch.zeros(N, dtype=torch.float64), alone])
+    scene = RecordingInfo(100.0, "deg/s", ("a", "b", "c", "d"))
+    simulation = NOISE.simulate(N, batch=(4, 4), generator=g)
+    found = RandomTelegraph.detect_and_fit(Comparison.of(scene, noise + 0.8 * jumps, simulation), 1e-3)
+    assert found is not None
+    assert found.sensors == (0, 1, 3)
+    assert isinstance(found.effect, RandomTelegraph)
+    assert found.effect.signs in ((1, -1, 0, 0), (-1, 1, 0, 0))
+    assert "at the same times in sensors a, b" in found.sentence
+    made = found.effect.apply(torch.zeros(4, N, dtype=torch.float64), scene, g).sign()
+    assert torch.equal(made[0], -made[1])
+    assert not made[2].any()
+    assert not torch.equal(made[0], made[3])
+
+
+def test_sensors_that_jump_by_themselves_share_nothing():
+    g = torch.Generator().manual_seed(81)
+    jumps = torch.stack([_path(N, 120.0, 120.0, g) for _ in range(3)])
+    common = 0.7 * torch.randn(2, N, generator=g, dtype=torch.float64)  # what both sides share beside that
+    sides = [NOISE.simulate(N, batch=(3,), generator=g) + one for one in common]
+    scene = RecordingInfo(100.0, "deg/s", ("a", "b", "c"))
+    found = RandomTelegraph.detect_and_fit(Comparison.of(scene, sides[0] + 0.8 * jumps, sides[1][None]), 1e-3)
+    assert found is not None
+    assert isinstance(found.effect, RandomTelegraph)
+    assert found.effect.signs == ()
