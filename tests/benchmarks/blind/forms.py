@@ -185,6 +185,29 @@ def level_of_channel(bench: Bench, nats: float) -> Part:
     return replace(part, form="of a channel", channel="motor_command", channels={"motor_command": command})
 
 
+def tone_of_channel(bench: Bench, nats: float) -> Part:
+    """Vibration of a motor, whose command is a channel: it turns faster, a little late, and shakes more as it does."""
+    sensors = bench.some_sensors(1)
+    t = np.arange(bench.n) / bench.n
+    swings = [np.sin(2 * np.pi * (bench.rng.uniform(1, 12) * t + bench.rng.uniform())) for _ in range(5)]
+    course = np.sum(swings, 0)
+    command = (course - course.min()) / (course.max() - course.min())
+    keeps = math.exp(-1 / (bench.rng.uniform(0.0, 0.1) * bench.rate + 1e-3))
+    speed = sps.lfilter([1 - keeps], [1, -keeps], command, zi=[keeps * command[0]])[0]
+    low, high = bench.rng.uniform(0.05, 0.15), bench.rng.uniform(0.25, 0.4)
+    f = low + (high - low) * speed
+    shake = f ** int(bench.rng.integers(0, 3)) * np.sin(2 * np.pi * (f.cumsum() + bench.rng.uniform()))
+    part, _ = bench.shape(
+        "drifting_tone",
+        nats,
+        bench.gains(sensors)[:, None] * shake / np.abs(shake).max(),
+        known=True,
+        channel="motor_command",
+        channels={"motor_command": command},
+    )
+    return replace(part, form="of a channel")
+
+
 def several_modes(bench: Bench, nats: float) -> Part:
     """A structure with two modes."""
     sensors = bench.some_sensors()

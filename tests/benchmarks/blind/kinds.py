@@ -150,6 +150,7 @@ _FORMS: dict[str, Callable[[Bench, float], Part]] = {
     "asymmetric_telegraph": _with(spectral.random_telegraph, asymmetries=(2.2, 3.2)),
     "ramp_of_level": forms.ramp_of_level,
     "level_of_channel": forms.level_of_channel,
+    "tone_of_channel": forms.tone_of_channel,
     "several_steps": _with(shapes.step, count=3),
     "several_modes": forms.several_modes,
     "swapped": forms.swapped,

@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.signal import lfilter
 from torch import Tensor
 
 from gyrofuse._base.results import readable
@@ -99,9 +100,15 @@ def channel_track(comparison: Comparison) -> ChannelTrack | None:
     white, rows = white[:, part], [(name, k, u[part]) for name, k, u in rows]
     n, affordable = white.shape[-1], 10 * many / (white.numel() * len(rows))
     lengths = [length for length in (64, 128, 256, 512) if length == 64 or length < affordable]
-    scanned = [
-        (_scanned(white, name, k, u, length), u) for length in lengths if n // length >= 16 for name, k, u in rows
+    tried = [(length, *row) for length in lengths for row in rows]
+    # What turns comes to its speed late: roughly, in segments that are not longer than it is known to.
+    tried += [
+        (length, name, k, late(u, seconds * comparison.info.rate))
+        for length in lengths[:2]
+        for name, k, u in rows
+        for seconds in (0.03, 0.1)
     ]
+    scanned = [(_scanned(white, name, k, u, length), u) for length, name, k, u in tried if n // length >= 16]
     if not scanned:
         return None
     log_ratio = float(torch.tensor([one.log_ratio for one, _ in scanned]).logsumexp(0)) - math.log(len(scanned))
@@ -169,6 +176,14 @@ def as_it_moves(row: Tensor) -> Tensor:
         return row
     at = np.interp(np.arange(len(row)), starts.numpy(), row[starts].numpy())
     return torch.from_numpy(at)
+
+
+def late(row: Tensor, samples: float) -> Tensor:
+    """A mean `(time,)` over the past of a row, with weights that fall exponentially within so many samples."""
+    if samples <= 0:
+        return row
+    keeps = math.exp(-1 / samples)
+    return torch.from_numpy(lfilter([1 - keeps], [1, -keeps], row.numpy(), zi=(row[:1] * keeps).numpy())[0])
 
 
 def _middle(row: Tensor) -> tuple[float, float]:

@@ -7,11 +7,10 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 import torch
-from scipy.signal import lfilter
 from torch import Tensor
 
 from gyrofuse.mismatch.decisions import NATS_PER_NUMBER
-from gyrofuse.mismatch.detectors.moving.channel_tracks import ChannelTrack, as_it_moves
+from gyrofuse.mismatch.detectors.moving.channel_tracks import ChannelTrack, as_it_moves, late
 from gyrofuse.mismatch.mechanisms.mechanism import Parameter
 from gyrofuse.mismatch.mechanisms.transients.carrier import Carrier
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
@@ -62,9 +61,9 @@ class ChannelLine:
         rate, n = comparison.info.rate, comparison.n_samples
         row, most = comparison.info.channel_rows(track.channel)[track.row], 512  # knots
         none, n_knots = torch.zeros(1, comparison.n_sensors, dtype=torch.float64), min(2 * n // track.length, most)
-        offset, slope, late, bend = track.offset * rate, track.slope * rate, 0.0, 0.0
+        offset, slope = track.offset * rate, track.slope * rate
         tried = [
-            cls(track.channel, track.row, straight, offset, slope, bend, late, float(u.median()), False, 0, none, none)
+            cls(track.channel, track.row, straight, offset, slope, 0.0, 0.0, float(u.median()), False, 0, none, none)
             for straight, u in ((False, row), (True, as_it_moves(row)))
             if not straight or u is not row
         ]
@@ -130,12 +129,7 @@ class ChannelLine:
     def _course(self, info: RecordingInfo) -> Tensor:
         """What the frequency follows, `(time,)`."""
         row = info.channel_rows(self.channel)[self.row]
-        row = as_it_moves(row) if self.straight else row
-        if not self.late_s:
-            return row
-        keeps = math.exp(-1 / (self.late_s * info.rate))
-        start = (row[:1] * keeps).numpy()
-        return torch.from_numpy(lfilter([1 - keeps], [1, -keeps], row.numpy(), zi=start)[0])
+        return late(as_it_moves(row) if self.straight else row, self.late_s * info.rate)
 
     def frequencies(self, info: RecordingInfo, n_samples: int) -> Tensor:
         """Of a recording with these channels, Hz, `(time,)`."""
@@ -160,7 +154,7 @@ class ChannelLine:
     @property
     def law(self) -> str:
         """In words."""
-        late = f", {1e3 * self.late_s:.3g} ms late" if self.late_s else ""
+        lag = f", {1e3 * self.late_s:.3g} ms late" if self.late_s else ""
         what = "it" if self.of_channel else "its frequency"
         grows = ("", f", its size growing as {what}", f", its size growing as the square of {what}")[self.growth]
         nearly = 0.005  # of the frequency
@@ -170,7 +164,7 @@ class ChannelLine:
             law = f"{self.rise:.4g} Hz for each unit of it"
         else:
             law = f"{self.offset_hz:.4g} Hz and {self.rise:.4g} Hz for each unit of it"
-        return f"{law}{late}{grows}"
+        return f"{law}{lag}{grows}"
 
     @property
     def rise(self) -> float:
