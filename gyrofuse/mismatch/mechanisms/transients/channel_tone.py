@@ -141,7 +141,8 @@ class ChannelTone(Mechanism):
         low, high = min(float(f.min()) for f in courses), max(float(f.max()) for f in courses)
         gap = torch.full((1,), math.nan, dtype=torch.float64)  # between one line and the next
         seconds = torch.cat([comparison.info.seconds(comparison.n_samples), gap])
-        track = (seconds.repeat(len(courses)), torch.cat([torch.cat([f, gap]) for f in courses])) if fitted else None
+        lines = torch.cat([torch.cat([f, gap]) for f in courses])
+        track = (seconds.repeat(len(courses))[:-1], lines[:-1]) if fitted else None
         window = 256 / comparison.info.rate
         pictures.spectrogram(ax, comparison, sensor, (low - (high - low) / 4, high + (high - low) / 4), window, track)
 
