@@ -12,7 +12,7 @@ from scipy import integrate, stats
 from torch import Tensor
 
 from gyrofuse import AR1, RandomWalk, WhiteNoise
-from gyrofuse.mismatch.detectors.lines import chirps as sweeps
+from gyrofuse.mismatch.detectors.moving import chirps as sweeps
 from gyrofuse.mismatch.detectors.slow import hysteresis
 from gyrofuse.mismatch.detectors.variance import modulation, noise_level
 from gyrofuse.mismatch.detectors.variance import outliers as impulses

@@ -15,6 +15,7 @@ from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.likelihoods.noise_near import noise_along
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanisms.spectra.bumps.wandering_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.transients.channel_line import ChannelLine
 from gyrofuse.mismatch.mechanisms.transients.transient import held_out_sums, in_fours, kept_of
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
@@ -33,10 +34,10 @@ class ChannelTone(Mechanism):
         lines: In the order in which they were found.
     """
 
-    name: ClassVar[str] = "drifting_tone"
+    name: ClassVar[str] = DriftingTone.name
     likelihood: ClassVar[str] = "transients"
     additive: ClassVar[bool] = True
-    separated_by: ClassVar[str] = "a recording in which the channel has another course"
+    separated_by: ClassVar[str] = DriftingTone.separated_by
     lines: tuple[ChannelLine, ...]
 
     @classmethod
