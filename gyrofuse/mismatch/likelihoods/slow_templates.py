@@ -12,12 +12,12 @@ from functools import partial
 from typing import NamedTuple
 
 import torch
-from scipy.signal import lfilter
 from torch import Tensor
 
 from gyrofuse.mismatch.likelihoods.declared import declared
 from gyrofuse.mismatch.likelihoods.slow_noise import ordinates, slow_ordinates
 from gyrofuse.mismatch.signals.comparison import N_BLOCKS, Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.filters import late
 
 # A grid of templates is as fine as keeps neighbours correlated by 0.9 or more, where the noise is white.
 _TIME_CONSTANTS = 24
@@ -190,12 +190,7 @@ def lagged(info: RecordingInfo, channel: str, row: int, lag: float, n_samples: i
             f"`channels`: expected {channel!r} at {n_samples} samples or more, got {len(x)}; "
             "give it for the whole record"
         )
-    x = x[:n_samples]
-    if not lag:
-        return x
-    keeps = math.exp(-1 / lag)
-    y, _ = lfilter([1 - keeps], [1, -keeps], x.numpy(), zi=[keeps * float(x[0])])
-    return torch.from_numpy(y)
+    return late(x[:n_samples], lag)
 
 
 def edges() -> Tensor:

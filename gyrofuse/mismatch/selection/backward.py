@@ -149,10 +149,10 @@ def _renamed(
     selected: list[Selected], lost: list[int], names: set[str], level: float, generator: torch.Generator
 ) -> tuple[list[Selected], Comparison]:
     """The findings without those that lost, and with what is found under some names instead."""
-    first, selected_before = lost[0], selected
+    first, beaten = lost[0], tuple(sorted({selected[k].finding.mechanism for k in lost}))
     kept = [one.finding for k, one in enumerate(selected) if k > first and k not in lost]
     selected, comparison = _repaired(selected[:first], kept, selected[first].before, generator)
-    kinds, beaten = named(names), tuple(sorted({selected_before[k].finding.mechanism for k in lost}))
+    kinds = named(names)
     for _ in lost:
         beside = replace(comparison, passed_over=beaten)
         found = [f for kind in kinds if (f := kind.detect_and_fit(beside, level)) is not None]

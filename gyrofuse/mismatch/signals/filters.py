@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import torch
+from scipy.signal import lfilter
 from torch import Tensor
 
 from gyrofuse._base.transforms import fast_length
@@ -93,3 +95,11 @@ def _mirrored(index: Tensor, n: int) -> Tensor:
     """Indices beyond the ends, as if in a mirror."""
     index = index.remainder(2 * n)
     return torch.where(index < n, index, 2 * n - 1 - index)
+
+
+def late(row: Tensor, samples: float) -> Tensor:
+    """A mean `(time,)` over the past of a row, with weights that fall exponentially within so many samples."""
+    if samples <= 0:
+        return row
+    keeps = math.exp(-1 / samples)
+    return torch.from_numpy(lfilter([1 - keeps], [1, -keeps], row.numpy(), zi=(row[:1] * keeps).numpy())[0])

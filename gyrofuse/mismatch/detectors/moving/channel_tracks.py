@@ -5,8 +5,9 @@ moves nothing but the phase, it stays at `a`. Whitened records that were turned 
 of segments and bins, over the medians of 32 bins beside each other, are standard exponential by noise and `1 + s` times
 as large on the tone. What stays where it is in the recording is spread out by that.
 
-Statistic: mean likelihood ratio over slopes `b`, frequencies `a`, tones' powers `s`, sets of sensors, rows, and lengths
-of segments. Null law: that of an e-value (`p_value_from_e_value`), whatever the channel's course is.
+Statistic: mean likelihood ratio over slopes `b`, frequencies `a`, tones' powers `s`, sets of sensors, rows as they came
+and late, and lengths of segments. Null law: that of an e-value (`p_value_from_e_value`), whatever the channel's course
+is.
 """
 
 from __future__ import annotations
@@ -17,18 +18,18 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.signal import lfilter
 from torch import Tensor
 
 from gyrofuse._base.results import readable
 from gyrofuse._base.transforms import squared_modulus
 from gyrofuse.mismatch.detectors.moving.chirps import decorrelated_record
-from gyrofuse.mismatch.detectors.moving.moving_lines import moving_line_test, over_paths
+from gyrofuse.mismatch.detectors.moving.moving_lines import moving_line_test, over_paths, tone_gains
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.detectors.slow.channels import auxiliary
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
+from gyrofuse.mismatch.signals.filters import late
 from gyrofuse.mismatch.signals.psd import light_taper
 from gyrofuse.mismatch.stats.multiplicity import p_value_from_e_value, sidak
 
@@ -178,14 +179,6 @@ def as_it_moves(row: Tensor) -> Tensor:
     return torch.from_numpy(at)
 
 
-def late(row: Tensor, samples: float) -> Tensor:
-    """A mean `(time,)` over the past of a row, with weights that fall exponentially within so many samples."""
-    if samples <= 0:
-        return row
-    keeps = math.exp(-1 / samples)
-    return torch.from_numpy(lfilter([1 - keeps], [1, -keeps], row.numpy(), zi=(row[:1] * keeps).numpy())[0])
-
-
 def _middle(row: Tensor) -> tuple[float, float]:
     """The middle of a row, and the width of what nine tenths of it lie in, or all."""
     low, middle, high = torch.quantile(row, torch.tensor([0.05, 0.5, 0.95], dtype=row.dtype)).tolist()
@@ -217,8 +210,4 @@ def _cells(white: Tensor, cycles: Tensor, length: int) -> Tensor:
     power = squared_modulus(torch.fft.fft(segments * light_taper(length).to(torch.float32)))
     blocks = power.unflatten(-1, (-1, beside))
     power = (blocks / (blocks.median(-1, keepdim=True).values / math.log(2)).clamp(min=1e-30)).flatten(-2)
-    m = 0.48 * beside  # exponential variables whose mean is as well known as these medians
-    s = torch.tensor([2.0, 8.0, 32.0]).view(-1, 1, 1)  # of a tone over the noise of a segment
-    # Of powers over an estimate, which are F distributed: they are as large by chance more often.
-    own = (m + 1) * (torch.log1p(power / m)[:, None] - torch.log1p(power[:, None] / (m * (1 + s)))) - s.log1p()
-    return torch.cat([own.sum(0, keepdim=True), own]) if len(white) > 1 else own
+    return tone_gains(power, 0.48 * beside)  # exponential variables whose mean is as well known as these medians

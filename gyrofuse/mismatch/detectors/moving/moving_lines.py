@@ -132,13 +132,25 @@ def _cell_ratios(power: Tensor) -> tuple[Tensor, Tensor]:
 
     Of all sensors together, and of each alone. The same in units of probability, for sums.
     """
-    p, count, bins = power.shape
-    m = 0.48 / (1 / count + 1 / bins)  # exponential variables whose mean is as well known as these medians
+    _, count, bins = power.shape
+    # Exponential variables whose mean is as well known as these medians.
+    gains = tone_gains(power, 0.48 / (1 / count + 1 / bins))
+    return gains, gains.clamp(max=600.0).exp()
+
+
+def tone_gains(power: Tensor, m: float) -> Tensor:
+    """Log likelihood ratios of tones in cells of powers `(sensor, segment, bin)`, `(set, power, segment, bin)`.
+
+    Of all sensors together, and of each alone.
+
+    Args:
+        power: Over a noise that is known as from `m` exponential variables.
+        m: Their number.
+    """
     s = torch.tensor([2.0, 8.0, 32.0], dtype=power.dtype).view(-1, 1, 1)  # of a tone over the noise of a segment
     # Of powers over an estimate, which are F distributed: they are as large by chance more often.
     own = (m + 1) * (torch.log1p(power / m)[:, None] - torch.log1p(power[:, None] / (m * (1 + s)))) - s.log1p()
-    gains = torch.cat([own.sum(0, keepdim=True), own]) if p > 1 else own
-    return gains, gains.clamp(max=600.0).exp()
+    return torch.cat([own.sum(0, keepdim=True), own]) if len(power) > 1 else own
 
 
 def over_paths(ratios: Tensor) -> Tensor:

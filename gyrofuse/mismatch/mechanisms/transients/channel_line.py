@@ -10,12 +10,13 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.decisions import NATS_PER_NUMBER
-from gyrofuse.mismatch.detectors.moving.channel_tracks import ChannelTrack, as_it_moves, late
+from gyrofuse.mismatch.detectors.moving.channel_tracks import ChannelTrack, as_it_moves
 from gyrofuse.mismatch.mechanisms.mechanism import Parameter
 from gyrofuse.mismatch.mechanisms.transients.carrier import Carrier
+from gyrofuse.mismatch.mechanisms.transients.transient import path_gain
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import Dims
-from gyrofuse.mismatch.signals.lines import whitened
+from gyrofuse.mismatch.signals.filters import late
 from gyrofuse.mismatch.stats.limits import Z
 
 
@@ -59,7 +60,7 @@ class ChannelLine:
     def followed(cls, comparison: Comparison, track: ChannelTrack) -> ChannelLine:
         """Fitted to all samples, its line straightened by the phases of ever longer stretches."""
         rate, n = comparison.info.rate, comparison.n_samples
-        row, most = comparison.info.channel_rows(track.channel)[track.row], 512  # knots
+        row, most = track.values(comparison), 512  # knots
         none, n_knots = torch.zeros(1, comparison.n_sensors, dtype=torch.float64), min(2 * n // track.length, most)
         offset, slope = track.offset * rate, track.slope * rate
         tried = [
@@ -284,12 +285,16 @@ class ChannelLine:
 
     def gain(self, comparison: Comparison) -> float:
         """Log likelihood ratio to none, nats."""
-        taken = whitened(self.path(comparison.info, comparison.n_samples), comparison.base)
-        return float((comparison.white * taken - taken.square() / 2).sum())
+        return path_gain(comparison, self.path(comparison.info, comparison.n_samples))
+
+    @property
+    def numbers(self) -> int:
+        """How many it has."""
+        return 2 * len(self.cosine) + int(self.cosine.any(0).sum()) + self.growth
 
     def cost(self) -> float:
         """Nats that so many numbers gain by chance, and more."""
-        return NATS_PER_NUMBER * (2 * len(self.cosine) + int(self.cosine.any(0).sum()) + self.growth)
+        return NATS_PER_NUMBER * self.numbers
 
     def path(self, info: RecordingInfo, n_samples: int) -> Tensor:
         amplitude = torch.complex(self.cosine, -self.sine)

@@ -12,20 +12,18 @@ from torch import Tensor
 from gyrofuse._base.results import readable
 from gyrofuse.mismatch.detectors.moving.channel_tracks import channel_track
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
-from gyrofuse.mismatch.likelihoods.noise_near import noise_along
 from gyrofuse.mismatch.mechanisms import pictures
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
 from gyrofuse.mismatch.mechanisms.spectra.bumps.wandering_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.transients.channel_line import ChannelLine
-from gyrofuse.mismatch.mechanisms.transients.transient import held_out_sums, in_fours, kept_of
+from gyrofuse.mismatch.mechanisms.transients.transient import Transient, kept_of
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
-from gyrofuse.mismatch.signals.lines import whitened
 from gyrofuse.mismatch.stats.inclusion import included_sensors
 from gyrofuse.mismatch.stats.limits import Z
 
 
 @dataclass(frozen=True, eq=False)
-class ChannelTone(Mechanism):
+class ChannelTone(Transient):
     """Lines along the rows of a channel, and along one of them at several multiples: motors, and what turns with them.
 
     In another recording, of another course of the channel, their amplitudes are steady and their phases others.
@@ -35,8 +33,6 @@ class ChannelTone(Mechanism):
     """
 
     name: ClassVar[str] = DriftingTone.name
-    likelihood: ClassVar[str] = "transients"
-    additive: ClassVar[bool] = True
     separated_by: ClassVar[str] = DriftingTone.separated_by
     lines: tuple[ChannelLine, ...]
 
@@ -87,16 +83,10 @@ class ChannelTone(Mechanism):
             levels=tuple(sorted({level_of(max(float(f) / info.rate, 1 / n)) for f in ends.flatten()})),
             channel=first.channel,
             frequency_hz=first.middle_hz,
-            gain=self._gain(comparison),
+            gain=self.gained(comparison, sum(line.numbers for line in self.lines)),
         )
 
-    def _gain(self, comparison: Comparison) -> float:
-        """Log likelihood ratio to none, less what the numbers cost, nats."""
-        taken = whitened(self._path(comparison.info, comparison.n_samples), comparison.base)
-        own = float((comparison.white * taken - taken.square() / 2).sum())
-        return own - sum(line.cost() for line in self.lines)
-
-    def _path(self, info: RecordingInfo, n_samples: int) -> Tensor:
+    def path_along(self, info: RecordingInfo, n_samples: int) -> Tensor:
         return torch.stack([line.path(info, n_samples) for line in self.lines]).sum(0)
 
     @property
@@ -112,22 +102,6 @@ class ChannelTone(Mechanism):
             for record, own in zip(records, turns.tolist(), strict=True)
         ]
         return torch.stack(drawn).view_as(signal)
-
-    def remove(self, signal: Tensor, info: RecordingInfo) -> Tensor:
-        return signal - self._path(info, signal.shape[-1])
-
-    def repair(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
-        return comparison.subtract(self._path(comparison.info, comparison.n_samples))
-
-    def apply_elsewhere(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
-        """It has another phase there."""
-        return self.apply_to_reference(comparison, generator)
-
-    def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
-        white = comparison.white
-        taken = whitened(self._path(comparison.info, comparison.n_samples), comparison.base)
-        gains = held_out_sums(white * taken - taken.square() / 2, fold)
-        return in_fours((gains / noise_along(taken, white - taken).clamp(min=1e-300)).sum(0))
 
     def fit_without(self, comparison: Comparison, fold: int) -> ChannelTone:
         """Amplitudes anew, of each line beside the others."""

@@ -16,10 +16,9 @@ from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
 from gyrofuse.mismatch.mechanisms.transients.carrier import Carrier
-from gyrofuse.mismatch.mechanisms.transients.transient import Transient, kept_of
+from gyrofuse.mismatch.mechanisms.transients.transient import Transient, kept_of, path_gain
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.dims import Dims
-from gyrofuse.mismatch.signals.lines import whitened
 from gyrofuse.mismatch.stats.inclusion import included_sensors
 from gyrofuse.mismatch.stats.limits import Z
 from gyrofuse.mismatch.stats.multiplicity import sidak
@@ -131,8 +130,7 @@ class Chirp(Transient):
 
     def _gain(self, comparison: Comparison) -> float:
         """Log likelihood ratio to none, nats."""
-        taken = whitened(self.path(comparison.n_samples, comparison.info.rate), comparison.base)
-        return float((comparison.white * taken - taken.square() / 2).sum())
+        return path_gain(comparison, self.path(comparison.n_samples, comparison.info.rate))
 
     def _cost(self) -> float:
         """Nats that so many numbers gain by chance, and more."""

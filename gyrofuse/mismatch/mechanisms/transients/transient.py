@@ -29,6 +29,10 @@ class Transient(Mechanism):
         """What was found in the recording, `(sensor, time)`."""
         raise NotImplementedError
 
+    def path_along(self, info: RecordingInfo, n_samples: int) -> Tensor:
+        """The same in a recording with these channels, which by default it does not follow."""
+        return self.path(n_samples, info.rate)
+
     def drawn(self, n_samples: int, rate: float, generator: torch.Generator) -> Tensor:
         """The same at other times, for one record, `(sensor, time)`."""
         raise NotImplementedError
@@ -39,25 +43,31 @@ class Transient(Mechanism):
         return torch.stack(drawn).view_as(signal)
 
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
-        n, white = comparison.n_samples, comparison.white
-        taken = whitened(self.path(n, comparison.info.rate), comparison.base)
+        white = comparison.white
+        taken = whitened(self.path_along(comparison.info, comparison.n_samples), comparison.base)
         gains = held_out_sums(white * taken - taken.square() / 2, fold)
         return in_fours((gains / noise_along(taken, white - taken).clamp(min=1e-300)).sum(0))
 
     def gained(self, comparison: Comparison, numbers: int) -> float:
         """Log likelihood ratio in sample less what so many numbers cost, nats: which course it is, it says as well."""
-        taken = whitened(self.path(comparison.n_samples, comparison.info.rate), comparison.base)
-        return float((comparison.white * taken - taken.square() / 2).sum()) - NATS_PER_NUMBER * numbers
+        path = self.path_along(comparison.info, comparison.n_samples)
+        return path_gain(comparison, path) - NATS_PER_NUMBER * numbers
 
     def remove(self, signal: Tensor, info: RecordingInfo) -> Tensor:
-        return signal - self.path(signal.shape[-1], info.rate)
+        return signal - self.path_along(info, signal.shape[-1])
 
     def repair(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
-        return comparison.subtract(self.path(comparison.n_samples, comparison.info.rate))
+        return comparison.subtract(self.path_along(comparison.info, comparison.n_samples))
 
     def apply_elsewhere(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
         """It comes at other times there."""
         return self.apply_to_reference(comparison, generator)
+
+
+def path_gain(comparison: Comparison, path: Tensor) -> float:
+    """Log likelihood ratio of a path `(sensor, time)` to none, nats."""
+    taken = whitened(path, comparison.base)
+    return float((comparison.white * taken - taken.square() / 2).sum())
 
 
 def hourly(count: int, duration_s: float) -> Parameter:
