@@ -395,5 +395,5 @@ def test_digits_are_those_that_the_interval_leaves():
 
     assert _resolved(Parameter(137.200123, 137.200100, 137.200146, "Hz"))["low"] == "137.2001"
     assert _resolved(Parameter(2.76896e-05, 2.0579e-05, 3.48e-05, "deg/s"))["value"] == "2.77e-05"
-    assert _resolved(Parameter(57.295779, 57.295779, 57.295779, ""))["value"] == "57.3"
+    assert _resolved(Parameter.exact(57.295779, ""))["value"] == "57.3"
     assert _resolved(Parameter(1.0, -math.inf, math.inf, ""))["low"] == "-"

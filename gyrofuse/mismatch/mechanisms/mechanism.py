@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -13,7 +14,7 @@ from torch import Tensor
 from gyrofuse._base.axes import clean_name, new_axes_below_each_other
 from gyrofuse._base.deprecation import RenamedAttribute
 from gyrofuse._base.results import cleaned, readable
-from gyrofuse.mismatch.mechanisms.alternative import Alternative
+from gyrofuse.mismatch.mechanisms.rivals import Alternative, Rival
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.folds import sd_of_sum, spectral_gains
 
@@ -29,17 +30,22 @@ class Parameter(NamedTuple):
     high: float
     unit: str
 
+    @classmethod
+    def around(
+        cls, value: float, reach: float, unit: str, *, least: float = -math.inf, most: float = math.inf
+    ) -> Parameter:
+        """Limits as far below a number as above it, within what it can be."""
+        return cls(value, max(value - reach, least), min(value + reach, most), unit)
 
-class Rival(NamedTuple):
-    """A mechanism fitted in the place of a finding of another one.
+    @classmethod
+    def within(cls, value: float, factor: float, unit: str) -> Parameter:
+        """Limits at so many times a number, and at its part."""
+        return cls(value, value / factor, value * factor, unit)
 
-    Attributes:
-        effect: Mechanism with its numbers.
-        score: Log likelihood ratio in sample less what its numbers cost, nats; compared among rivals of one likelihood.
-    """
-
-    effect: Mechanism
-    score: float
+    @classmethod
+    def exact(cls, value: float, unit: str) -> Parameter:
+        """A number that the values themselves show."""
+        return cls(value, value, value, unit)
 
 
 class Mechanism:

@@ -106,7 +106,7 @@ class ChannelNoise(LevelCourse):
         parameters = {}
         for i in sensors:
             value, reach = float(known.factor[i]), math.exp(Z * float(course.log_factor_sd[i]))
-            parameters[f"factor[{i}]"] = Parameter(value, value / reach, value * reach, "")
+            parameters[f"factor[{i}]"] = Parameter.within(value, reach, "")
         largest = max(sensors, key=lambda i: abs(math.log(float(known.factor[i]))))
         return effect.found(
             f"the noise's variance in {info.named(sensors, 'all sensors')} follows {_WORDS[kind]}{readable(name)}"

@@ -106,7 +106,7 @@ class GradualChange(LevelCourse):
         parameters, way = {}, _Way.of(course.share if rises else 1 - course.share, rate)
         for i in sensors:
             value, spread = float(factor[i]), math.exp(float(reach[i]))
-            parameters[f"factor[{i}]"] = Parameter(value, value / spread, value * spread, "")
+            parameters[f"factor[{i}]"] = Parameter.within(value, spread, "")
         return effect.found(
             _sentence(comparison, way, factor, sensors),
             p_value,

@@ -84,7 +84,7 @@ class ScaleMixture(Mechanism):
             parameters[f"share[{i}]"] = Parameter(100 * law.share, low, high, "%")
             reach = math.exp(Z * ratio_sd)
             value = float(ratio[i])
-            parameters[f"ratio[{i}]"] = Parameter(value, value / reach, value * reach, "")
+            parameters[f"ratio[{i}]"] = Parameter.within(value, reach, "")
         largest = max(hit, key=lambda i: gains[i])
         return cls(share, torch.where(ratio > 0, ratio, 1.0)).found(
             f"the noise of {info.named(hit, 'all sensors')} has two levels, sample by sample: "

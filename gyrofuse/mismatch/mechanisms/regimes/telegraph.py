@@ -83,7 +83,7 @@ class RandomTelegraph(Mechanism):
             )
             for (name, values, unit), sd in zip(found, fit.log_sd, strict=True):
                 value, reach = float(values[i]), math.exp(min(Z * sd, 50.0))
-                parameters[f"{name}[{i}]"] = Parameter(value, value / reach, value * reach, unit)
+                parameters[f"{name}[{i}]"] = Parameter.within(value, reach, unit)
         largest = max(sensors, key=lambda i: float(effect.half_step[i]))
         where = comparison.info.named(sensors, "all sensors")
         return effect.found(

@@ -230,7 +230,7 @@ def _size(fit: ChannelFit, sensor: int, unit: str, factor: float) -> Parameter:
     size = float(gains[0] if len(gains) == 1 else gains.norm())
     direction = gains / max(abs(size), 1e-300)
     reach = Z * math.sqrt(float(direction @ covariance @ direction))
-    return Parameter(size, size - reach if len(gains) == 1 else max(size - reach, 0.0), size + reach, unit)
+    return Parameter.around(size, reach, unit, least=-math.inf if len(gains) == 1 else 0.0)
 
 
 def not_identifiable(finding: Finding, seen: str) -> Finding:

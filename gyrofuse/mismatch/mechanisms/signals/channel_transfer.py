@@ -253,6 +253,6 @@ def _gain_and_delay(
     late, reach = -phase * ms, Z * sd_across / max(size, 1e-300) * ms
     unit = f"{info.measure} per unit of {name}"
     return (
-        Parameter(sign * size, sign * size - Z * sd, sign * size + Z * sd, unit),
-        Parameter(late, late - reach, late + reach, "ms"),
+        Parameter.around(sign * size, Z * sd, unit),
+        Parameter.around(late, reach, "ms"),
     )

@@ -62,8 +62,8 @@ class Motion(Transient):
         inside, reach = 1.5 * seen.cell / info.rate, 2 * seen.cell / info.rate + 2 * float(effect.smooth_s[0])
         start, stop = seen.first / info.rate + inside, seen.end / info.rate - inside
         parameters = {
-            "start": Parameter(start, max(start - reach, 0.0), start + reach, "s"),
-            "stop": Parameter(stop, stop - reach, min(stop + reach, n / info.rate), "s"),
+            "start": Parameter.around(start, reach, "s", least=0.0),
+            "stop": Parameter.around(stop, reach, "s", most=n / info.rate),
         }
         which = tuple(torch.stack([one.which for one in stretches]).any(0).nonzero()[:, 0].tolist())
         size = effect.root[0].square().sum(-1).sqrt()  # (sensor,)
@@ -73,7 +73,7 @@ class Motion(Transient):
         for i in which:
             value = float(size[i])
             spread = math.exp(2 / math.sqrt(2 * free))
-            parameters[f"rms[{i}]"] = Parameter(value, value / spread, value * spread, info.measure)
+            parameters[f"rms[{i}]"] = Parameter.within(value, spread, info.measure)
         moves = "moves" if len(which) == 1 else "move together"
         others = len(stretches) - 1
         more = f", and {others} more time{'s' if others > 1 else ''}" if others else ""

@@ -52,7 +52,7 @@ class SensorDelay(Mechanism):
         parameters = {}
         for i in sensors:
             value, reach = ms * float(found.delay[i]), ms * Z * float(found.sd[i])
-            parameters[f"delay[{i}]"] = Parameter(value, value - reach, value + reach, "ms")
+            parameters[f"delay[{i}]"] = Parameter.around(value, reach, "ms")
         largest = max(sensors, key=lambda i: abs(parameters[f"delay[{i}]"].value))
         by = parameters[f"delay[{largest}]"].value
         return cls(torch.where(late, found.delay, 0.0)).found(

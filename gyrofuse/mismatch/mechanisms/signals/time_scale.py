@@ -68,7 +68,7 @@ class TimeScale(Mechanism):
             found.p_value,
             tuple(range(comparison.n_sensors)),
             {
-                "ratio": Parameter(found.ratio, found.ratio - reach, found.ratio + reach, ""),
+                "ratio": Parameter.around(found.ratio, reach, ""),
                 "rate": Parameter(
                     info.rate / found.ratio, info.rate / (found.ratio + reach), info.rate / (found.ratio - reach), "Hz"
                 ),

@@ -14,7 +14,8 @@ from torch import Tensor
 from gyrofuse._base.transforms import squared_modulus
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.mechanisms import pictures
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter, Rival
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanisms.rivals import Rival
 from gyrofuse.mismatch.mechanisms.signals.harmonics import (
     Harmonics,
     folded,
@@ -97,9 +98,7 @@ class VibrationTone(Mechanism):
         for k in sorted((squares[1:].amax(-1).argsort(descending=True)[:most_told] + 1).tolist()):
             harmonic, i = tone.harmonics[k - 1], int(squares[k].argmax())
             size, reach = float(torch.hypot(harmonic.cosine[i], harmonic.sine[i])), Z * float(sd[k, i])
-            parameters[f"harmonic_{harmonic.multiple}[{i}]"] = Parameter(
-                size, size - reach, size + reach, comparison.info.measure
-            )
+            parameters[f"harmonic_{harmonic.multiple}[{i}]"] = Parameter.around(size, reach, comparison.info.measure)
         largest = max(present, key=lambda i: parameters[f"amplitude[{i}]"].value)
         info = comparison.info
         where = info.named(present, "all sensors")
@@ -352,4 +351,4 @@ def _tail_limits(snr: Tensor, seen: float) -> Tensor:
 
 
 def _limits(value: float, sd: float, unit: str) -> Parameter:
-    return Parameter(value, value - Z * sd, value + Z * sd, unit)
+    return Parameter.around(value, Z * sd, unit)

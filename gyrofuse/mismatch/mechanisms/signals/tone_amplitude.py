@@ -12,7 +12,8 @@ from torch import Tensor
 from gyrofuse.mismatch.detectors.lines.line_sizes import line_sizes
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.mechanisms import pictures
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter, Rival
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanisms.rivals import Rival
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples, signal_gains
@@ -114,4 +115,4 @@ class ToneSize(Mechanism):
 
 
 def _limits(value: float, sd: float, unit: str) -> Parameter:
-    return Parameter(value, max(value - Z * sd, 0.0), value + Z * sd, unit)
+    return Parameter.around(value, Z * sd, unit, least=0.0)

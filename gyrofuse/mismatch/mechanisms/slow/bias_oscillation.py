@@ -67,7 +67,7 @@ class BiasOscillation(SlowEffect):
         finding = slow_finding(comparison, strong, effect, found, words, {}, sizes=sizes)
         amplitude, sd = effect.amplitude, (effect.sizes * found.sd).square().sum(-1).sqrt() / effect.amplitude
         limits = {
-            f"amplitude[{i}]": Parameter(a, max(a - Z * s, 0.0), a + Z * s, info.measure)
+            f"amplitude[{i}]": Parameter.around(a, Z * s, info.measure, least=0.0)
             for i, a, s in zip(range(len(sd)), amplitude.tolist(), sd.tolist(), strict=True)
             if i in scan.sensors
         }

@@ -59,7 +59,7 @@ class DriftingScale(Mechanism):
         parameters = {}
         for i in sensors:
             value, reach = 100 * float(gains.slope[i]), 100 * Z * float(gains.slope_sd[i])
-            parameters[f"slope[{i}]"] = Parameter(value, value - reach, value + reach, "% per unit")
+            parameters[f"slope[{i}]"] = Parameter.around(value, reach, "% per unit")
         largest = max(sensors, key=lambda i: abs(float(gains.slope[i])))
         return effect.found(
             f"the scale factor of {info.named(sensors, 'all sensors')} follows {gains.channel}: what moves them is put "

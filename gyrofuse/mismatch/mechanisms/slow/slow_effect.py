@@ -23,7 +23,8 @@ from gyrofuse.mismatch.detectors.slow.scans import Scan, SlowAnalysis, slow_anal
 from gyrofuse.mismatch.likelihoods.slow_noise import cosines
 from gyrofuse.mismatch.likelihoods.slow_templates import SlowTemplates
 from gyrofuse.mismatch.mechanisms import pictures
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter, Rival
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanisms.rivals import Rival
 from gyrofuse.mismatch.signals.comparison import N_BLOCKS, Comparison, RecordingInfo, block_means
 from gyrofuse.mismatch.signals.dims import Dims, OfSensors
 from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED, in_fold
@@ -255,7 +256,7 @@ def slow_finding(
     for path, (name, unit) in enumerate(sizes[: found.size.shape[-1]]):
         for i in which:
             value, reach = float(effect.sizes[i, path]), Z * float(found.sd[i, path])
-            limits[f"{name}[{i}]"] = Parameter(value, value - reach, value + reach, unit)
+            limits[f"{name}[{i}]"] = Parameter.around(value, reach, unit)
     up_to, article = effect.amplitude, "an" if of[0] in "aeiou" else "a"
     largest = max(which, key=lambda i: float(up_to[i]))
     # A block is no more than half a wavelet there.

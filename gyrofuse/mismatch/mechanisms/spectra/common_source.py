@@ -16,7 +16,8 @@ from gyrofuse.mismatch.likelihoods.spectra.data import reference_noise
 from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios
 from gyrofuse.mismatch.likelihoods.spectra.starts import common_starts
 from gyrofuse.mismatch.mechanisms import pictures
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter, Rival
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanisms.rivals import Rival
 from gyrofuse.mismatch.mechanisms.spectra.findings import found, spanned
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import chosen_shape, refit
 from gyrofuse.mismatch.mechanisms.spectra.rivals import fit_alone, happened_instead
@@ -80,10 +81,10 @@ class CommonMode(Addition):
         parameters = {}
         for i in sensors:
             s, d = float(size[i]), float(sd[i])
-            parameters[f"gain[{i}]"] = Parameter(s, max(s - Z * d, 0.0), s + Z * d, unit)
+            parameters[f"gain[{i}]"] = Parameter.around(s, Z * d, unit, least=0.0)
             if term.turned:
                 turn, reach = math.degrees(float(gain[i].angle())), math.degrees(Z * d / s)
-                parameters[f"phase[{i}]"] = Parameter(turn, turn - reach, turn + reach, "deg")
+                parameters[f"phase[{i}]"] = Parameter.around(turn, reach, "deg")
         corner = 0.0
         if term.kind == "ar1":
             middle, spread = float(term.shared[0]), float(shape.sd[1][0])

@@ -16,7 +16,8 @@ from gyrofuse.mismatch.likelihoods.spectra.coherence import coherence_of, connec
 from gyrofuse.mismatch.likelihoods.spectra.data import block_spectra, reference_noise
 from gyrofuse.mismatch.likelihoods.spectra.mixing import Mixing, mixing_of, of_known_powers
 from gyrofuse.mismatch.mechanisms import pictures
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter, Rival
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
+from gyrofuse.mismatch.mechanisms.rivals import Rival
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import leading_shape
 from gyrofuse.mismatch.mechanisms.spectra.spectral import Spectral
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
@@ -56,7 +57,7 @@ class CrossTalk(Spectral):
         rows, columns = found.free.nonzero(as_tuple=True)
         for i, j in zip(rows.tolist(), columns.tolist(), strict=True):
             m, reach = float(found.matrix[i, j]), Z * float(found.sd[i, j])
-            parameters[f"part_of_{j + 1}[{i}]"] = Parameter(m, m - reach, m + reach, "")
+            parameters[f"part_of_{j + 1}[{i}]"] = Parameter.around(m, reach, "")
         told = (found.matrix.abs() > Z * found.sd) & found.free
         sensors = tuple((told | (found.free & ~told & ~told.mT)).any(-1).nonzero()[:, 0].tolist())
         return effect.found(

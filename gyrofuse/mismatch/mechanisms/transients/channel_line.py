@@ -232,7 +232,7 @@ class ChannelLine:
         reach = Z * covariance.diagonal().clamp(min=0).sqrt()
         values = (self.middle_hz, self.rise)
         return tuple(  # type: ignore[return-value]
-            Parameter(value, value - own, value + own, unit)
+            Parameter.around(value, own, unit)
             for value, own, unit in zip(values, reach.tolist(), ("Hz", "Hz per unit"), strict=True)
         )
 

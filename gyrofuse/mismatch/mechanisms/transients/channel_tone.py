@@ -64,7 +64,7 @@ class ChannelTone(Transient):
             there |= set(own)
             for i in own if not k else [int(size.argmax())]:
                 a, reach = float(size[i]), Z * float(sd[i])
-                parameters[f"amplitude{suffix}[{i}]"] = Parameter(a, max(a - reach, 0.0), a + reach, info.measure)
+                parameters[f"amplitude{suffix}[{i}]"] = Parameter.around(a, reach, info.measure, least=0.0)
         ends = torch.stack([torch.stack([f.min(), f.max()]) for f in (one.frequencies(info, n) for one in self.lines)])
         sensors, first = tuple(sorted(there)), self.lines[0]
         sizes = torch.stack([line.size(comparison) for line in self.lines])

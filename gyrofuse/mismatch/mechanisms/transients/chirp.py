@@ -74,14 +74,14 @@ class Chirp(Transient):
         start, stop = np.interp([first, last], effect.time_s.numpy(), effect.frequency_hz.numpy()).tolist()
         reach = 1 / (4 * step)  # a quarter of a bin of two steps
         parameters = {
-            "start": Parameter(first, max(first - 4 * step, 0.0), first + 4 * step, "s"),
-            "stop": Parameter(last, last - 4 * step, min(last + 4 * step, n / info.rate), "s"),
-            "start_frequency": Parameter(start, max(start - reach, 0.0), start + reach, "Hz"),
-            "stop_frequency": Parameter(stop, max(stop - reach, 0.0), stop + reach, "Hz"),
+            "start": Parameter.around(first, 4 * step, "s", least=0.0),
+            "stop": Parameter.around(last, 4 * step, "s", most=n / info.rate),
+            "start_frequency": Parameter.around(start, reach, "Hz", least=0.0),
+            "stop_frequency": Parameter.around(stop, reach, "Hz", least=0.0),
         }
         for i in there:
             a, own = float(size[i]), Z * float(sd[i])
-            parameters[f"amplitude[{i}]"] = Parameter(a, max(a - own, 0.0), a + own, info.measure)
+            parameters[f"amplitude[{i}]"] = Parameter.around(a, own, info.measure, least=0.0)
         loudest = max(there, key=lambda i: float(size[i]))
         does = "runs up" if stop > start * _MOVES else "runs down" if start > stop * _MOVES else "changes its speed"
         return effect.found(

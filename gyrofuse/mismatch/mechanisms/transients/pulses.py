@@ -73,7 +73,7 @@ class Pulses(Transient):
         }
         for i in strongest.amplitude.nonzero()[:, 0].tolist():
             value, reach = float(strongest.amplitude[i]), Z * float(strongest.sd[i])
-            parameters[f"amplitude[{i}]"] = Parameter(value, value - reach, value + reach, info.measure)
+            parameters[f"amplitude[{i}]"] = Parameter.around(value, reach, info.measure)
         concerned = tuple((effect.size != 0).any(0).nonzero()[:, 0].tolist())
         largest, onset = int(strongest.amplitude.abs().argmax()), strongest.pulse.onset / rate
         many = "a pulse" if len(pulses) == 1 else f"{len(pulses)} pulses"

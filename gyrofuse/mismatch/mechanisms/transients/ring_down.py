@@ -92,15 +92,15 @@ class RingDown(Transient):
         often = hourly(knocks, effect.duration_s)
         parameters = {
             "rate": often,
-            "frequency": Parameter(f, max(f - spread, 0.0), min(f + spread, info.rate / 2), "Hz"),
-            "decay_time": Parameter(decay, decay / factor, decay * factor, "s"),
+            "frequency": Parameter.around(f, spread, "Hz", least=0.0, most=info.rate / 2),
+            "decay_time": Parameter.within(decay, factor, "s"),
         }
         amplitude = torch.hypot(*strongest.size)
         # Of the two parts of an amplitude the one along its phase counts.
         sd = (strongest.size * size_sd).square().sum(0).sqrt() / amplitude.clamp(min=1e-300)
         for i in there:
             a, reach = float(amplitude[i]), Z * float(sd[i])
-            parameters[f"amplitude[{i}]"] = Parameter(a, max(a - reach, 0.0), a + reach, info.measure)
+            parameters[f"amplitude[{i}]"] = Parameter.around(a, reach, info.measure, least=0.0)
         concerned = tuple((effect.amplitude > 0).any(0).nonzero()[:, 0].tolist())
         largest, onset = int(amplitude.argmax()), strongest.tone.onset / info.rate
         return effect.found(

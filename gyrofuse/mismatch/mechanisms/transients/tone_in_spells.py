@@ -95,13 +95,13 @@ class ToneInSpells(Transient):
         spread = Z * math.sqrt(12 / energy) / (2 * math.pi * float(lengths[longest])) * info.rate
         start, stop = float(effect.start_s[longest]), float(effect.stop_s[longest])
         parameters = {
-            "frequency": Parameter(frequency, frequency - spread, frequency + spread, "Hz"),
-            "start": Parameter(start, max(start - reach, 0.0), start + reach, "s"),
-            "stop": Parameter(stop, stop - reach, min(stop + reach, effect.duration_s), "s"),
+            "frequency": Parameter.around(frequency, spread, "Hz"),
+            "start": Parameter.around(start, reach, "s", least=0.0),
+            "stop": Parameter.around(stop, reach, "s", most=effect.duration_s),
         }
         for i in there:
             a, sd = float(effect.amplitude[longest, i]), float(variance[longest, i].sqrt())
-            parameters[f"amplitude[{i}]"] = Parameter(a, max(a - Z * sd, 0.0), a + Z * sd, info.measure)
+            parameters[f"amplitude[{i}]"] = Parameter.around(a, Z * sd, info.measure, least=0.0)
         loudest = max(there, key=lambda i: float(effect.amplitude[longest, i]))
         more = f" and {len(spells) - 1} more times, {float(lengths.sum()) / n:.1%} of the time," if spells[1:] else ""
         return effect.found(

@@ -46,9 +46,7 @@ class Clipping(Mechanism):
         effect = cls(_limits_of(found, -1, comparison), _limits_of(found, 1, comparison), comparison.recording.mean(-1))
         sensors = tuple(sorted({end.sensor for end in found}))
         parameters = {
-            f"{'high' if end.sign > 0 else 'low'}[{end.sensor}]": Parameter(
-                end.limit, end.limit, end.limit, comparison.info.measure
-            )
+            f"{'high' if end.sign > 0 else 'low'}[{end.sensor}]": Parameter.exact(end.limit, comparison.info.measure)
             for end in found
         }
         where = comparison.info.named(sensors, "all sensors")

@@ -51,7 +51,7 @@ class HeldValues(Mechanism):
         for i, clock in found.items():
             period[i], phase[i] = clock.period, clock.phase
             rate, reach = info.rate / clock.period, Z * info.rate / clock.period**2 * clock.sd
-            parameters[f"rate[{i}]"] = Parameter(rate, rate - reach, rate + reach, "Hz")
+            parameters[f"rate[{i}]"] = Parameter.around(rate, reach, "Hz")
         effect = cls(period, phase, seen.expected.clamp(max=0.999))
         slowest = max(found, key=lambda i: found[i].period)
         return effect.found(

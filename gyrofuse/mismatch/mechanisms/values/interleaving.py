@@ -44,7 +44,7 @@ class Interleaving(KnownPath):
         sd = (found.noise * comparison.base.spectrum(half)[:, 0] / comparison.n_samples).sqrt()
         effect = cls(_means(comparison.recording, there))
         limits = {
-            f"offset[{i}]": Parameter(a, a - Z * s, a + Z * s, info.measure)
+            f"offset[{i}]": Parameter.around(a, Z * s, info.measure)
             for i, a, s in zip(range(len(sd)), effect.offset.tolist(), sd.tolist(), strict=True)
             if i in there
         }

@@ -61,7 +61,7 @@ class InterpolatedSamples(Mechanism):
         for i in sensors:
             share, lengths = float(effect.probability[i]), run_lengths(lines.inside[i])
             reach = Z * float(lengths.square().sum().sqrt()) / n  # each gap comes or does not
-            parameters[f"probability[{i}]"] = Parameter(share, max(share - reach, 0.0), min(share + reach, 1.0), "")
+            parameters[f"probability[{i}]"] = Parameter.around(share, reach, "", least=0.0, most=1.0)
         largest = max(sensors, key=lambda i: float(effect.probability[i]))
         jointly = " at the same time" if effect.together else ""
         return effect.found(

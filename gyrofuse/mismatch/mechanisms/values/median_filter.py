@@ -59,7 +59,7 @@ class MedianFilter(Mechanism):
             f"{100 * float(share.max()):.3g} % of the values come back within its window",
             min(p_values),
             sensors,
-            {f"window[{i}]": Parameter(float(window[i]), float(window[i]), float(window[i]), "") for i in sensors},
+            {f"window[{i}]": Parameter.exact(float(window[i]), "") for i in sensors},
             levels=tuple(range(1, 1 + math.ceil(math.log2(max(sizes))))),
             gain=float(effect._scores(comparison).sum()),
         )

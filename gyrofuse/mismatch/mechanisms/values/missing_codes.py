@@ -49,7 +49,7 @@ class MissingCodes(Mechanism):
             assert lattice is not None
             step[i], offset[i] = lattice.step, lattice.offset
             share = sum(shift != 0 for shift in one.shifts) / len(one.shifts)
-            parameters[f"missing_share[{i}]"] = Parameter(share, share, share, "")
+            parameters[f"missing_share[{i}]"] = Parameter.exact(share, "")
         effect = cls(step, offset, tuple(found[i].shifts if i in found else () for i in range(comparison.n_sensors)))
         where = info.named(tuple(found), "all sensors")
         bits = sorted({one.bit for one in found.values() if one.bit is not None})

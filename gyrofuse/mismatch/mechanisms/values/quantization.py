@@ -151,13 +151,12 @@ class Quantization(Mechanism):
         effect = effect._placed(effect._values(comparison))
         sensors = tuple(sorted({*found, *coarser}))
         parameters = {
-            f"simulated_lsb[{i}]": Parameter(own.step, own.step, own.step, comparison.info.measure)
-            for i, own in coarser.items()
+            f"simulated_lsb[{i}]": Parameter.exact(own.step, comparison.info.measure) for i, own in coarser.items()
         }
         for i in found:
             value = float(step[i])
             reach = Z * effect._step_sd(i, comparison.recording[i])
-            parameters[f"lsb[{i}]"] = Parameter(value, value - reach, value + reach, comparison.info.measure)
+            parameters[f"lsb[{i}]"] = Parameter.around(value, reach, comparison.info.measure)
         words = []
         if found:
             where = comparison.info.named(tuple(found), "all sensors")

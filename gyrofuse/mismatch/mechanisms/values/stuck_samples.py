@@ -74,7 +74,7 @@ class StuckSamples(Mechanism):
             clustered = float(runs.square().sum() / runs.sum()) if len(runs) else 1.0
             spread = math.sqrt(own * (1 - own) * clustered / found.n)
             sd = math.hypot(float(found.sd[i]), spread) / (1 - float(effect.by_chance[i]))
-            parameters[f"probability[{i}]"] = Parameter(value, max(value - Z * sd, 0.0), min(value + Z * sd, 1.0), "")
+            parameters[f"probability[{i}]"] = Parameter.around(value, Z * sd, "", least=0.0, most=1.0)
         where, longest = comparison.info.named(sensors, "all sensors"), max(effect.row)
         hangs = f", {longest:.0f} times one after the other" if longest > _LONG else ""
         largest = max(sensors, key=lambda i: float(effect.probability[i]))
@@ -115,7 +115,7 @@ class StuckSamples(Mechanism):
         for i in sensors:
             share = float(effect.probability[i])
             reach = Z * math.sqrt(share * (1 - share) / n)
-            parameters[f"probability[{i}]"] = Parameter(share, max(share - reach, 0.0), min(share + reach, 1.0), "")
+            parameters[f"probability[{i}]"] = Parameter.around(share, reach, "", least=0.0, most=1.0)
         largest = max(sensors, key=lambda i: float(effect.probability[i]))
         values = sorted({f"{filler[i]:.6g}" for i in sensors})
         return effect.found(

@@ -13,7 +13,8 @@ from torch import Tensor
 from gyrofuse._base.units import GRAVITY
 from gyrofuse.mismatch.detectors.spectra.band_tests import power_tails
 from gyrofuse.mismatch.mechanisms import pictures
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter, Rival
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanisms.rivals import Rival
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 
 _UNITS = {
@@ -67,7 +68,7 @@ class UnitScale(Mechanism):
             "give both in the same unit",
             min(float(tails.nan_to_num(nan=1.0).amin()) * tails.numel(), 1.0),
             tuple(range(comparison.n_sensors)),
-            {"factor": Parameter(factor, factor, factor, "")},
+            {"factor": Parameter.exact(factor, "")},
             gain=math.inf,
         )
 

@@ -109,7 +109,7 @@ class Seen(NamedTuple):
                 reference = peak.gain[peak.gain.abs().argmax()]
                 turn = math.degrees(float((peak.gain[i] * reference.conj()).angle()))
                 reach = math.degrees(Z * sd / (2 * value))
-                parameters[f"phase[{i}]"] = Parameter(turn, turn - reach, turn + reach, "deg")
+                parameters[f"phase[{i}]"] = Parameter.around(turn, reach, "deg")
         other = ("resonance",) if effect.name == "drifting_tone" else ("drifting_tone",)
         alternatives = tuple(sorted({*self.rivals, *(other if self.verdict.open else ())} - {effect.name}))
         return effect.found(

@@ -86,7 +86,7 @@ class WanderingHarmonics(DriftingTone):
             reach = Z * size / line.square.clamp(min=1e-12).sqrt()
             for i in sensors if line is own else [int(line.square.argmax())]:
                 value, span = float(size[i]), float(reach[i])
-                parameters[f"{name}[{i}]"] = Parameter(value, max(value - span, 0.0), value + span, info.measure)
+                parameters[f"{name}[{i}]"] = Parameter.around(value, span, info.measure, least=0.0)
         fundamental = peak.centre * rate / family.multiple
         times = ", ".join(str(line.multiple) for line in family.lines[1:])
         itself = "" if family.multiple == 1 else f", of which it is {family.multiple} times"
