@@ -20,7 +20,8 @@ from torch import Tensor
 import gyrofuse as gf
 from gyrofuse.cli.reading import read_model
 from gyrofuse.mismatch.mechanisms.catalogue import CATALOGUE
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
 from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
 from gyrofuse.mismatch.mechanisms.remainders.coherence import CoherenceRemainder
 from gyrofuse.mismatch.mechanisms.remainders.slow import SlowRemainder

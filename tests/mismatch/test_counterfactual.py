@@ -16,8 +16,8 @@ from gyrofuse.mismatch.detectors.slow.scans import slow_analysis
 from gyrofuse.mismatch.detectors.spectra.peak_fit import Oscillation
 from gyrofuse.mismatch.detectors.spectra.peaks import Stretch
 from gyrofuse.mismatch.detectors.spectra.steadiness import Steadiness, steadiness
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter, repaired
-from gyrofuse.mismatch.mechanisms.rivals import Alternative
+from gyrofuse.mismatch.mechanisms.finding_parts import Alternative, Parameter
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, repaired
 from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone, amplitude_limits, line_near
 from gyrofuse.mismatch.mechanisms.slow.late_warm_up import LateWarmUp
 from gyrofuse.mismatch.mechanisms.slow.step import Step

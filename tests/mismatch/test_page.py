@@ -16,7 +16,7 @@ from reference import haar as naive
 import gyrofuse as gf
 from gyrofuse.mismatch import Finding, MismatchReport
 from gyrofuse.mismatch.detectors.result import TestResult
-from gyrofuse.mismatch.mechanisms.mechanism import Parameter
+from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
 from gyrofuse.mismatch.mechanisms.spectra.bumps.wandering_tone import DriftingTone
 from gyrofuse.mismatch.repair.inputs import prepared
 from gyrofuse.mismatch.reporting import text as telling

@@ -14,7 +14,7 @@ from pages import Page
 
 import gyrofuse as gf
 from gyrofuse.mismatch import SessionsReport, diagnose_sessions
-from gyrofuse.mismatch.mechanisms.mechanism import Parameter
+from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
 from gyrofuse.mismatch.repair.serialise import sessions_from_dict
 from gyrofuse.mismatch.several.recurrence import CommonParameter
 

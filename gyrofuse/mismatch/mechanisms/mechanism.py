@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -14,7 +13,7 @@ from torch import Tensor
 from gyrofuse._base.axes import clean_name, new_axes_below_each_other
 from gyrofuse._base.deprecation import RenamedAttribute
 from gyrofuse._base.results import cleaned, readable
-from gyrofuse.mismatch.mechanisms.rivals import Alternative, Rival
+from gyrofuse.mismatch.mechanisms.finding_parts import Alternative, Parameter
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.folds import sd_of_sum, spectral_gains
 
@@ -22,30 +21,16 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-class Parameter(NamedTuple):
-    """A number with its limits at the confidence level of the diagnosis."""
+class Rival(NamedTuple):
+    """A mechanism fitted in the place of a finding of another one.
 
-    value: float
-    low: float
-    high: float
-    unit: str
+    Attributes:
+        effect: Mechanism with its numbers.
+        score: Log likelihood ratio in sample less what its numbers cost, nats; compared among rivals of one likelihood.
+    """
 
-    @classmethod
-    def around(
-        cls, value: float, reach: float, unit: str, *, least: float = -math.inf, most: float = math.inf
-    ) -> Parameter:
-        """Limits as far below a number as above it, within what it can be."""
-        return cls(value, max(value - reach, least), min(value + reach, most), unit)
-
-    @classmethod
-    def within(cls, value: float, factor: float, unit: str) -> Parameter:
-        """Limits at so many times a number, and at its part."""
-        return cls(value, value / factor, value * factor, unit)
-
-    @classmethod
-    def exact(cls, value: float, unit: str) -> Parameter:
-        """A number that the values themselves show."""
-        return cls(value, value, value, unit)
+    effect: Mechanism
+    score: float
 
 
 class Mechanism:

@@ -14,7 +14,8 @@ from gyrofuse._base.page import image, number, render
 from gyrofuse._base.results import format_p_value, readable
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.mechanisms.catalogue import STAGES, named
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
+from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
+from gyrofuse.mismatch.mechanisms.mechanism import Finding
 from gyrofuse.mismatch.reporting.figures_data import VarianceComparison, compared_powers, grouped_spectrum
 from gyrofuse.mismatch.reporting.outcome import Outcome
 from gyrofuse.mismatch.reporting.plots import (

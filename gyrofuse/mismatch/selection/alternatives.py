@@ -12,8 +12,8 @@ from dataclasses import replace
 
 from gyrofuse._base.results import readable
 from gyrofuse.mismatch.mechanisms.catalogue import named
+from gyrofuse.mismatch.mechanisms.finding_parts import Alternative
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
-from gyrofuse.mismatch.mechanisms.rivals import Alternative
 from gyrofuse.mismatch.selection.held_out import HeldOutScore, score_held_out
 from gyrofuse.mismatch.signals.comparison import Comparison
 

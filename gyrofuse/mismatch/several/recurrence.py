@@ -9,7 +9,8 @@ from typing import Any, Literal, TypeGuard
 
 from scipy import stats
 
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
+from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
+from gyrofuse.mismatch.mechanisms.mechanism import Finding
 from gyrofuse.mismatch.stats.limits import Z, variance_of, weighted_mean
 from gyrofuse.mismatch.stats.multiplicity import sidak_level
 

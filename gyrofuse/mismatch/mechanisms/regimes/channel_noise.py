@@ -19,7 +19,8 @@ from gyrofuse.mismatch.detectors.variance.noise_level import (
     variance_p_value,
     whitened_recording,
 )
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
+from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
+from gyrofuse.mismatch.mechanisms.mechanism import Finding
 from gyrofuse.mismatch.mechanisms.regimes.changing_variance import (
     MOSTLY,
     LevelCourse,

@@ -26,7 +26,8 @@ from gyrofuse.mismatch.likelihoods.outlier_law import (
 )
 from gyrofuse.mismatch.likelihoods.two_levels import TwoLevels
 from gyrofuse.mismatch.mechanisms import pictures
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
 from gyrofuse.mismatch.mechanisms.regimes.outlier_limits import with_limits
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import OfSensors

@@ -16,8 +16,9 @@ from gyrofuse.mismatch.detectors.slow.channels import ChannelFit, regress
 from gyrofuse.mismatch.detectors.slow.transfer import Transfer, likeliest_transfer
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.mechanisms import pictures
+from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
 from gyrofuse.mismatch.mechanisms.known_path import KnownPath
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
+from gyrofuse.mismatch.mechanisms.mechanism import Finding
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.signals.folds import estimation_samples, signal_gains

@@ -20,8 +20,9 @@ from gyrofuse.mismatch.likelihoods.finite_response import (
     response_at,
 )
 from gyrofuse.mismatch.mechanisms import pictures
+from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
 from gyrofuse.mismatch.mechanisms.known_path import KnownPath
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
+from gyrofuse.mismatch.mechanisms.mechanism import Finding
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.dims import Dims

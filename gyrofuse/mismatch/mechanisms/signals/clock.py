@@ -13,7 +13,8 @@ from gyrofuse.mismatch.detectors.lines.clocks import SIMULATION, strongest_slip
 from gyrofuse.mismatch.detectors.lines.demodulation import BLOCKS, best_slope, demodulated
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.mechanisms import pictures
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.signals.filters import resampled

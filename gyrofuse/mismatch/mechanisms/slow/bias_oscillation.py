@@ -14,7 +14,8 @@ from gyrofuse.mismatch.detectors.slow.estimates import estimate, log_factors, on
 from gyrofuse.mismatch.detectors.slow.scans import Scan
 from gyrofuse.mismatch.likelihoods.slow_noise import ordinates
 from gyrofuse.mismatch.likelihoods.slow_templates import Family
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
+from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
+from gyrofuse.mismatch.mechanisms.mechanism import Finding
 from gyrofuse.mismatch.mechanisms.slow.slow_effect import SlowEffect, in_seconds, slow_finding, strong_scan
 from gyrofuse.mismatch.signals.comparison import N_BLOCKS, Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import OfSensors

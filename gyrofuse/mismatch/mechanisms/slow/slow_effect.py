@@ -23,8 +23,8 @@ from gyrofuse.mismatch.detectors.slow.scans import Scan, SlowAnalysis, slow_anal
 from gyrofuse.mismatch.likelihoods.slow_noise import cosines
 from gyrofuse.mismatch.likelihoods.slow_templates import SlowTemplates
 from gyrofuse.mismatch.mechanisms import pictures
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
-from gyrofuse.mismatch.mechanisms.rivals import Rival
+from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Rival
 from gyrofuse.mismatch.signals.comparison import N_BLOCKS, Comparison, RecordingInfo, block_means
 from gyrofuse.mismatch.signals.dims import Dims, OfSensors
 from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED, in_fold

@@ -16,8 +16,8 @@ from gyrofuse.mismatch.likelihoods.spectra.coherence import coherence_of, connec
 from gyrofuse.mismatch.likelihoods.spectra.data import block_spectra, reference_noise
 from gyrofuse.mismatch.likelihoods.spectra.mixing import Mixing, mixing_of, of_known_powers
 from gyrofuse.mismatch.mechanisms import pictures
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
-from gyrofuse.mismatch.mechanisms.rivals import Rival
+from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Rival
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import leading_shape
 from gyrofuse.mismatch.mechanisms.spectra.spectral import Spectral
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo

@@ -18,8 +18,7 @@ from gyrofuse.mismatch.likelihoods.spectra.fit import pieces, powers
 from gyrofuse.mismatch.likelihoods.spectra.noise_parts import Parts
 from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios
 from gyrofuse.mismatch.likelihoods.spectra.starts import best_start
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
-from gyrofuse.mismatch.mechanisms.rivals import Rival
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Rival
 from gyrofuse.mismatch.mechanisms.spectra.findings import found, spanned
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import Shape, chosen_shape, refit
 from gyrofuse.mismatch.mechanisms.spectra.rivals import fit_alone, happened_instead, walks_of

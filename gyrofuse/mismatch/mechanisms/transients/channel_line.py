@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.decisions import NATS_PER_NUMBER
 from gyrofuse.mismatch.detectors.moving.channel_tracks import ChannelTrack, as_it_moves
-from gyrofuse.mismatch.mechanisms.mechanism import Parameter
+from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
 from gyrofuse.mismatch.mechanisms.transients.carrier import Carrier
 from gyrofuse.mismatch.mechanisms.transients.transient import path_gain
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo

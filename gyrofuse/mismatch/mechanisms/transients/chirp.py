@@ -14,7 +14,8 @@ from gyrofuse.mismatch.decisions import NATS_PER_NUMBER
 from gyrofuse.mismatch.detectors.moving.moving_lines import MovingLine, moving_line, moving_line_p_value, straight_line
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.mechanisms import pictures
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
+from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
+from gyrofuse.mismatch.mechanisms.mechanism import Finding
 from gyrofuse.mismatch.mechanisms.transients.carrier import Carrier
 from gyrofuse.mismatch.mechanisms.transients.transient import Transient, kept_of, path_gain
 from gyrofuse.mismatch.signals.comparison import Comparison

@@ -17,7 +17,8 @@ from gyrofuse.mismatch.detectors.variance.pulses import pulse_p_value, pulses_of
 from gyrofuse.mismatch.likelihoods.damped_tone import Surroundings
 from gyrofuse.mismatch.likelihoods.pulse import FittedPulse, Pulse, fitted_pulse, other_course, sized, width_limits
 from gyrofuse.mismatch.mechanisms import pictures
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
+from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
+from gyrofuse.mismatch.mechanisms.mechanism import Finding
 from gyrofuse.mismatch.mechanisms.transients.transient import Transient, hourly, often_words
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.dims import Dims

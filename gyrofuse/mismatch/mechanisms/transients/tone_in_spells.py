@@ -14,7 +14,8 @@ from gyrofuse.mismatch.decisions import NATS_PER_NUMBER, NEW_TERM_NATS
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.detectors.spectra.peaks import strongest_peak
 from gyrofuse.mismatch.mechanisms import pictures
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
+from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
+from gyrofuse.mismatch.mechanisms.mechanism import Finding
 from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
 from gyrofuse.mismatch.mechanisms.transients.transient import Transient, kept_of
 from gyrofuse.mismatch.signals.comparison import Comparison

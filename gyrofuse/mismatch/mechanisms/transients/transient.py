@@ -10,7 +10,8 @@ from torch import Tensor
 
 from gyrofuse.mismatch.decisions import NATS_PER_NUMBER
 from gyrofuse.mismatch.likelihoods.noise_near import noise_along
-from gyrofuse.mismatch.mechanisms.mechanism import Mechanism, Parameter
+from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
+from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED
 from gyrofuse.mismatch.signals.lines import whitened

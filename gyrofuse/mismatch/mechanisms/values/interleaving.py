@@ -10,8 +10,9 @@ from torch import Tensor
 
 from gyrofuse.mismatch.detectors.lines.interleaving import alternation, interleaving_p_value
 from gyrofuse.mismatch.mechanisms import pictures
+from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
 from gyrofuse.mismatch.mechanisms.known_path import KnownPath
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
+from gyrofuse.mismatch.mechanisms.mechanism import Finding
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples, signal_gains

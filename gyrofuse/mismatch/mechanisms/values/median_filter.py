@@ -11,7 +11,8 @@ from torch import Tensor
 
 from gyrofuse.mismatch.detectors.values.median_windows import came_back, median_windows
 from gyrofuse.mismatch.mechanisms import pictures
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
 from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter
 from gyrofuse.mismatch.mechanisms.values.stuck_samples import repeat_scores
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from gyrofuse.mismatch.detectors.values.sensor_gains import SensorGains, log_sizes, sensor_gains, sign_gain
 from gyrofuse.mismatch.mechanisms import pictures
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import N_JUDGED, estimation_samples, in_fold, signal_gains

@@ -14,7 +14,8 @@ from gyrofuse.mismatch.detectors.values.median_windows import median_windows
 from gyrofuse.mismatch.detectors.values.ties import missing_recurrences
 from gyrofuse.mismatch.detectors.values.values import repeats, repeats_so_far
 from gyrofuse.mismatch.mechanisms import pictures
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import OfSensors

@@ -13,8 +13,8 @@ from torch import Tensor
 from gyrofuse._base.units import GRAVITY
 from gyrofuse.mismatch.detectors.spectra.band_tests import power_tails
 from gyrofuse.mismatch.mechanisms import pictures
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
-from gyrofuse.mismatch.mechanisms.rivals import Rival
+from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Rival
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 
 _UNITS = {

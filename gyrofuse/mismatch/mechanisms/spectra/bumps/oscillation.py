@@ -16,7 +16,8 @@ from gyrofuse.mismatch.detectors.spectra.peaks import Stretch
 from gyrofuse.mismatch.detectors.spectra.steadiness import Steadiness, steadiness
 from gyrofuse.mismatch.likelihoods.spectra.common_sources import CommonBump
 from gyrofuse.mismatch.likelihoods.spectra.components import Peak, oscillation
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
 from gyrofuse.mismatch.mechanisms.spectra.findings import spanned
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import chosen_shape, leading_shape, refit, run_length
 from gyrofuse.mismatch.mechanisms.spectra.spectral import Addition, Spectral

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.detectors.spectra.peak_fit import Oscillation, oscillation_of
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
 from gyrofuse.mismatch.mechanisms.signals.harmonics import folded
 from gyrofuse.mismatch.mechanisms.spectra.bumps.oscillation import Mode, refitted_mode, wandering_sd
 from gyrofuse.mismatch.mechanisms.spectra.bumps.phase_track import Family, PhaseTrack, lines_in_step

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from gyrofuse.mismatch.detectors.spectra.frequency_courses import probably_normal, rampless_transform
 from gyrofuse.mismatch.mechanisms import pictures
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
 from gyrofuse.mismatch.mechanisms.spectra.bumps.oscillation import Mode, OscillationOnTop, nominated, refitted_mode
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.psd import drawn_towards
