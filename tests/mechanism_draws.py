@@ -67,7 +67,7 @@ from gyrofuse.mismatch.mechanisms.transients.chirp import Chirp
 from gyrofuse.mismatch.mechanisms.transients.pulses import Pulses
 from gyrofuse.mismatch.mechanisms.transients.ring_down import RingDown
 from gyrofuse.mismatch.mechanisms.transients.tone_in_spells import ToneInSpells
-from gyrofuse.mismatch.mechanisms.values.angle_quantization import AngleQuantization
+from gyrofuse.mismatch.mechanisms.values.angle_quantization import AngleCounts, AngleQuantization
 from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
 from gyrofuse.mismatch.mechanisms.values.held_values import HeldValues
@@ -119,6 +119,13 @@ def _(setting: Setting) -> Drawn:
     blur = setting.sizes(0.1, 0.2) * float(setting.size > 1)
     effect = Quantization(step, setting.sizes(-0.5, 0.5) * step, blur, setting.clean.mean(-1))
     return Drawn(effect, setting.of_each("lsb", step))
+
+
+@draws(AngleCounts)
+def _(setting: Setting) -> Drawn:
+    step = setting.sizes(0.8, 2.0) * min(setting.size, 2.0)
+    grid = Quantization(step, torch.zeros_like(step), torch.zeros_like(step), setting.clean.mean(-1))
+    return Drawn(AngleCounts(grid), setting.of_each("lsb", step))
 
 
 @draws(DeadBand)

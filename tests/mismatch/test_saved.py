@@ -70,7 +70,7 @@ from gyrofuse.mismatch.mechanisms.transients.chirp import Chirp
 from gyrofuse.mismatch.mechanisms.transients.pulses import Pulses
 from gyrofuse.mismatch.mechanisms.transients.ring_down import RingDown
 from gyrofuse.mismatch.mechanisms.transients.tone_in_spells import ToneInSpells
-from gyrofuse.mismatch.mechanisms.values.angle_quantization import AngleQuantization
+from gyrofuse.mismatch.mechanisms.values.angle_quantization import AngleCounts, AngleQuantization
 from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
 from gyrofuse.mismatch.mechanisms.values.held_values import HeldValues
@@ -236,6 +236,7 @@ EVERY = (
     WanderingHarmonics(MODE, True, 0.9, 2, (1, 3), (replace(MODE, centre=0.055), replace(MODE, centre=0.165))),
     FlickerNoise(numbers(1 / 3, 0.0)),
     AngleQuantization(numbers(1 / 3, 0.0)),
+    AngleCounts(Quantization(numbers(1.3, 0.0), numbers(0.0, 0.0), numbers(0.0, 0.0), numbers(1 / 3, 0.1))),
     CrossTalk(torch.tensor([[0.0, 1 / 3], [0.05, 0.0]], dtype=torch.float64)),
     CommonMode("ar1", 0.03, complex_numbers(0.1, 0.2j), BASE, True),
     SimulatedResonance(Resonance(MODE), BASE),

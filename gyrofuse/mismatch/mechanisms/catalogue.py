@@ -61,7 +61,7 @@ from gyrofuse.mismatch.mechanisms.transients.chirp import Chirp
 from gyrofuse.mismatch.mechanisms.transients.pulses import Pulses
 from gyrofuse.mismatch.mechanisms.transients.ring_down import RingDown
 from gyrofuse.mismatch.mechanisms.transients.tone_in_spells import ToneInSpells
-from gyrofuse.mismatch.mechanisms.values.angle_quantization import AngleQuantization
+from gyrofuse.mismatch.mechanisms.values.angle_quantization import AngleCounts, AngleQuantization
 from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
 from gyrofuse.mismatch.mechanisms.values.held_values import HeldValues
@@ -84,6 +84,7 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (SensorOrder,),  # whatever else is looked for sensor by sensor
     (UnitScale, SensorGain),
     # Facts on the numbers themselves.
+    (AngleCounts,),  # whose values lie on a grid as rounded ones do
     (MedianFilter, Quantization, MissingCodes, Clipping, HeldValues, StuckSamples, InterpolatedSamples),
     (Spikes, SimulatedSpikes, ScaleMixture),
     (ClockSkew, TimeScale),

@@ -45,6 +45,11 @@ def round_to_lattice(signal: Array, step: float | Array) -> Array:
     return step * np.round(signal / step)
 
 
+def count_angle(signal: Array, step: float) -> Array:
+    """Whole steps by which the integral of the rate moves from sample to sample."""
+    return step * np.diff(np.round(signal.cumsum(axis=-1) / step), prepend=0.0)
+
+
 def dead_band(signal: Array, width: float) -> Array:
     """Rates smaller than `width` read as zero."""
     return np.where(np.abs(signal) < width, 0.0, signal)

@@ -58,6 +58,7 @@ _MECHANISMS: dict[str, Callable[[Bench, float], Part]] = {
     "warm_up_transient": _with(shapes.warm_up_transient, thermometer="board"),
     "flicker": spectral.power_law,
     "quantization_noise": spectral.quantization_noise,
+    "angle_counts": marginal.angle_counts,
     "g_sensitivity": shapes.g_sensitivity,
     "common_mode": spectral.common_mode,
     "cross_talk": spectral.cross_talk,

@@ -217,6 +217,17 @@ def lattice(bench: Bench, nats: float) -> Part:
     )  # fmt: skip
 
 
+def angle_counts(bench: Bench, nats: float) -> Part:
+    """An angle counted in whole steps, as of an optical gyro: every sample is altered, so `nats` are unused."""
+    step = float(bench.rng.uniform(0.7, 3.0) * bench.sigma.mean())
+    everyone = tuple(range(bench.n_sensors))
+    return _touched(
+        "quantization_noise", CERTAIN, everyone, [CERTAIN] * len(everyone),
+        converter=lambda x: converter.count_angle(x, step),
+        parameters={"lsb": quantity(step, "deg/s")},
+    )  # fmt: skip
+
+
 def dead_band(bench: Bench, nats: float) -> Part:
     """Rates near zero read as zero; nats: the expected number of zeros."""
     sensors = bench.some_sensors(2)

@@ -11,7 +11,7 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from gyrofuse.mismatch.detectors.values.quantisation_grid import distinct_values, exact_lattices
+from gyrofuse.mismatch.detectors.values.quantisation_grid import distinct_values, exact_lattices, innovation_sd
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.records import Records
@@ -68,17 +68,19 @@ def came_back(values: Tensor, window: int) -> Tensor:
 def _returns(side: Records, came: Records, longest: int) -> Tensor:
     """Samples that equal the one of a lag before but none between, for lags from 2 on, `(sensor, lag)`.
 
-    A value that is met all over the record, as at an end stop or in the place of lost samples, does not count; nor do
-    values that came on a grid, whatever was taken off them.
+    A value that is met all over the record, as at an end stop or in the place of lost samples, does not count. Values
+    on a fine grid are taken as they came; those on a coarse one meet by chance, and none of them counts.
     """
-    signal = side.signal.movedim(1, 0)
+    coarse = 1 / 8  # sd of a sample given its past
+    steps = torch.tensor([0.0 if own is None else own.step for own in exact_lattices(came)], dtype=torch.float64)
+    rounded = (steps > 0)[:, None, None]
+    signal = torch.where(rounded, came.signal.movedim(1, 0), side.signal.movedim(1, 0))
     _, number, counts = signal.unique(return_inverse=True, return_counts=True)
-    seldom = counts[number] <= longest
+    seldom = (counts[number] <= longest) | rounded
     before = torch.nn.functional.pad(signal[..., 1:] == signal[..., :-1], (1, 0))
     found = []
     for lag in range(2, longest + 1):
         same = torch.nn.functional.pad(signal[..., lag:] == signal[..., :-lag], (lag, 0)) & ~before
         found.append((same & seldom).sum((1, 2)))
         before = before | same
-    rounded = torch.tensor([own is not None for own in exact_lattices(came)])
-    return torch.where(rounded[:, None], 0, torch.stack(found, -1))
+    return torch.where((steps > coarse * innovation_sd(came))[:, None], 0, torch.stack(found, -1))

@@ -17,7 +17,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.detectors.values.quantisation_grid import Lattice, distinct_values, exact_lattices
+from gyrofuse.mismatch.detectors.values.quantisation_grid import (
+    Lattice,
+    distinct_values,
+    exact_lattices,
+    simulated_lattices,
+)
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.records import Records
@@ -43,7 +48,7 @@ class CodeMap(NamedTuple):
 def missing_codes(comparison: Comparison) -> dict[int, CodeMap]:
     """Codes that sensors of the recording do not put out, and the simulation's do, by position of the sensor."""
     found = {}
-    own, theirs = exact_lattices(comparison.as_came), exact_lattices(comparison.reference)
+    own, theirs = exact_lattices(comparison.as_came), simulated_lattices(comparison)
     for i, (lattice, other) in enumerate(zip(own, theirs, strict=True)):
         code_map = None if lattice is None else _code_map(comparison.as_came, i, lattice)
         if code_map is None:

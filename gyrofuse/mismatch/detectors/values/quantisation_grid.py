@@ -127,16 +127,29 @@ def exact_lattices(side: Records) -> tuple[Lattice | None, ...]:
     return tuple(found)
 
 
+@derived
+def simulated_lattices(comparison: Comparison) -> tuple[Lattice | None, ...]:
+    """The exact grids of the simulation, with those of the recording that are too fine to be seen in its own noise."""
+    side = comparison.reference
+    found = list(exact_lattices(side))
+    for i, own in enumerate(exact_lattices(comparison.as_came)):
+        if own is not None and found[i] is None:
+            values = side.signal[0, i]
+            offset = _offset(values, own.step)
+            if float((off_lattice(values, own.step, offset).abs() < 0.01).to(torch.float64).mean()) >= 0.999:
+                found[i] = own._replace(offset=offset)
+    return tuple(found)
+
+
 def _exact_lattice(unique: Tensor, counts: Tensor, sd: float) -> Lattice | None:
     """Grid on which 999 of 1000 samples lie to a hundredth of a step: converters also have end stops.
 
-    Its step is the usual or the smallest gap between values, unless below a 50th of an sd: that is the noise of
+    Its step is the usual or the smallest gap between values, but for those below a 50th of an sd: that is the noise of
     arithmetic.
     """
     gaps = unique.diff()
-    for step in (float(gaps.median()), float(gaps.min())) if len(gaps) > 1 else ():
-        if step < sd / 50:
-            continue
+    wide = gaps[gaps >= sd / 50]
+    for step in (float(wide.median()), float(wide.min())) if len(wide) > 1 else ():
         k = torch.cat([torch.zeros(1, dtype=torch.float64), (gaps / step).round().cumsum(0)])
         middle, mean = ((counts * v).sum() / counts.sum() for v in (k, unique))
         step = float((counts * (k - middle) * (unique - mean)).sum() / (counts * (k - middle).square()).sum())
@@ -147,6 +160,11 @@ def _exact_lattice(unique: Tensor, counts: Tensor, sd: float) -> Lattice | None:
             told = found.has_zero and step < 3 * sd  # coarser ones are met by a bias that stays there
             return found._replace(cut_off=is_cut_off(step_counts(unique, counts, step))) if told else found
     return None
+
+
+def _offset(values: Tensor, step: float) -> float:
+    """Where a grid of a known step lies."""
+    return float(torch.exp(2j * math.pi / step * values).mean().angle()) / (2 * math.pi) * step
 
 
 def _hidden_step(rows: list[Tensor], sd: Tensor) -> HiddenStep:
@@ -253,8 +271,7 @@ def _lattice_at(unique: Tensor, peak: float, step: float) -> Lattice:
     power = float(_power(unique, torch.tensor([peak], dtype=torch.float64)))
     resultant = math.sqrt(max((power - 1) / (n - 1), 1e-12)) if n > 1 else 1e-6
     blur = math.sqrt(-2 * math.log(min(resultant, 1 - 1e-12))) / (2 * math.pi)
-    turn = torch.exp(2j * math.pi / step * unique).mean().angle()
-    return Lattice(step, float(turn) / (2 * math.pi) * step, blur, math.exp(-_power_beyond([unique], peak)), peak)
+    return Lattice(step, _offset(unique, step), blur, math.exp(-_power_beyond([unique], peak)), peak)
 
 
 def off_lattice(values: Tensor, step: float | Tensor, offset: float | Tensor) -> Tensor:
@@ -284,7 +301,7 @@ def missing_lattices(comparison: Comparison, level: float) -> Missing:
         comparison: Recording and simulation.
         level: p value above which a hidden step is none.
     """
-    observed, reference = exact_lattices(comparison.as_came), exact_lattices(comparison.reference)
+    observed, reference = exact_lattices(comparison.as_came), simulated_lattices(comparison)
     coarser = {
         i: other
         for i, other in enumerate(reference)
@@ -296,7 +313,8 @@ def missing_lattices(comparison: Comparison, level: float) -> Missing:
         if own is not None and (i in coarser or other is None or other.step <= own.step * (1 - 1e-3))
     }
     p_value = 0.0 if missing or coarser else 1.0
-    hidden = [i for i, own in enumerate(observed) if own is None]
+    values = distinct_values(comparison.as_came)
+    hidden = [i for i, own in enumerate(observed) if own is None and not _is_cut(values[i][1])]
     while hidden:
         p, here = _hidden_in(comparison, hidden, level)
         p_value = min(p_value, p)
@@ -320,14 +338,19 @@ def _too_coarse(comparison: Comparison, sensor: int, own: Lattice | None, other:
     if other.step < coarse * float(innovation_sd(comparison.reference)[sensor]):
         return False
     values = comparison.as_came.signal[0, sensor]
-    turn = torch.exp(2j * math.pi / other.step * values).mean().angle()
-    off = off_lattice(values, other.step, float(turn) / (2 * math.pi) * other.step)
+    off = off_lattice(values, other.step, _offset(values, other.step))
     if float((off.abs() < 0.01).to(torch.float64).mean()) > on:
         return False
     if own is not None:
         return own.step < other.step * (1 - 1e-3)
     unique = distinct_values(comparison.as_came)[sensor][0]
     return _lattice_at(unique, 2 * math.pi / other.step, other.step).p_value > CERTAIN
+
+
+def _is_cut(counts: Tensor) -> bool:
+    """Whether values, by how often each is there, pile up at both ends: what is between has a law with side lobes."""
+    piled = 0.005  # of the samples
+    return min(int(counts[0]), int(counts[-1])) > piled * int(counts.sum())
 
 
 def _hidden_in(comparison: Comparison, sensors: list[int], level: float) -> tuple[float, dict[int, Lattice]]:
@@ -357,7 +380,7 @@ def _as_large(missing: dict[int, Lattice]) -> dict[int, Lattice]:
 
 def _beside_simulation(comparison: Comparison, sensor: int, own: Lattice) -> float:
     """p value that a hidden grid of the recording is no clearer than the simulation's."""
-    other = exact_lattices(comparison.reference)[sensor]
+    other = simulated_lattices(comparison)[sensor]
     if other is not None:
         # What is taken off a recording blurs its own grid, of which harmonics may be left: peaks as wide as 1/sd.
         base = 2 * math.pi / other.step

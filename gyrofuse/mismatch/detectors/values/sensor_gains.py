@@ -179,6 +179,19 @@ def _signs(comparison: Comparison) -> tuple[Tensor, float]:
     if float(sign.sum()) < 0:
         sign = -sign
     gain = _gain(pairs, sign)
-    if bool((sign < 0).any()) and (lines is None or bool((lines.sign == sign).all())):
+    if bool((sign < 0).any()) and (lines is None or bool((lines.sign == sign).all())) and not _is_late(phases, sign):
         return sign, math.exp(-max(gain, 0.0))
     return torch.ones_like(sign), 1.0
+
+
+def _is_late(phases: Phases, sign: Tensor) -> bool:
+    """Whether a delay of the sensors that have the other sign fits the phases better, as of a filter of many taps."""
+    farthest, better = 32.0, 10.0  # samples; nats
+    late = torch.zeros_like(sign)
+    grid = torch.arange(-farthest, farthest + 0.125, 0.25, dtype=torch.float64)
+    for i in (sign < 0).nonzero()[:, 0].tolist():
+        tried = late.repeat(len(grid), 1)
+        tried[:, i] = grid
+        late[i] = grid[int(phases.likelihood(tried).argmax())]
+    turned = torch.einsum("i,bij,j->", sign, phases.weights.real, sign)
+    return float(phases.likelihood(late)) > float(turned) + better

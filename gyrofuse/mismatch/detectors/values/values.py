@@ -13,7 +13,7 @@ from torch import Tensor
 from gyrofuse.mismatch.decisions import CERTAIN, CHANCE
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.detectors.values.missing_codes import missing_codes
-from gyrofuse.mismatch.detectors.values.quantisation_grid import distinct_values, missing_lattices
+from gyrofuse.mismatch.detectors.values.quantisation_grid import distinct_values, exact_lattices, missing_lattices
 from gyrofuse.mismatch.detectors.values.straight_lines import straight_lines
 from gyrofuse.mismatch.detectors.values.ties import missing_recurrences, stands_alone
 from gyrofuse.mismatch.signals.comparison import Comparison
@@ -94,7 +94,25 @@ def repeats(comparison: Comparison) -> Repeats:
     counted = np.where(hangs.numpy(), hanging, np.maximum(compared, by_resolution_alone))
     p_values = torch.from_numpy(np.where(few.numpy() < 20.0, counted, many))
     coarser = _met_as_often_later(comparison.observed.signal.movedim(1, 0), share, expected, longest)
-    return Repeats(same[:, 0], share, expected, sd, torch.where(coarser, 1.0, p_values), n)
+    p_values = torch.where(coarser, 1.0, p_values).minimum(_in_a_row(longest, other_same, quieter, n))
+    return Repeats(same[:, 0], share, expected, sd, p_values, n)
+
+
+def _in_a_row(longest: Tensor, other: Tensor, quieter: Tensor, n: int) -> Tensor:
+    """p values of as many repeats in a row beside those of a simulation that repeats as well, `(sensor,)`.
+
+    One more follows there with a share that is known; rows less than twice as long as its own say nothing.
+
+    Args:
+        longest: Repeats in a row, `(sensor,)`.
+        other: The simulation's repeats, `(sensor, record, time)`.
+        quieter: By how much more often the recording's values meet, `(sensor,)`.
+        n: Samples of the recording.
+    """
+    total, events, own = other.sum((1, 2)), _events(other), repeats_so_far(other).amax((1, 2))
+    follows = ((total - events + 1) / (total + 2) * quieter).clamp(max=1.0)
+    rows = (n * follows.pow(longest)).clamp(max=1.0)  # expected number, each repeat by chance
+    return torch.where((longest >= 8) & (longest > 2 * own) & (events > 0), rows, 1.0)
 
 
 def _met_as_often_later(signal: Tensor, share: Tensor, expected: Tensor, longest: Tensor) -> Tensor:
@@ -126,8 +144,13 @@ def repeats_so_far(same: Tensor) -> Tensor:
 
 @derived
 def _resolutions(side: Records) -> Tensor:
-    """Smallest difference between two values of the first record, `(sensor,)`: its step where it is rounded."""
-    return torch.stack([_finest_gap(unique) for unique, _ in distinct_values(side)])
+    """Smallest difference between two values of the first record, `(sensor,)`: its step where it is rounded.
+
+    Values on a grid may differ from each other by what arithmetic left of it as well.
+    """
+    gaps = [_finest_gap(unique) for unique, _ in distinct_values(side)]
+    steps = (0.0 if own is None else own.step for own in exact_lattices(side))
+    return torch.stack([gap.clamp(min=0.99 * step) for gap, step in zip(gaps, steps, strict=True)])
 
 
 def _finest_gap(unique: Tensor) -> Tensor:

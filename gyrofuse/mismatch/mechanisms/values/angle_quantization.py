@@ -10,17 +10,20 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.detectors.values.angle_counts import angle_counts, counted
 from gyrofuse.mismatch.likelihoods.spectra.components import NO_SHARED, Term
 from gyrofuse.mismatch.likelihoods.spectra.fit import pieces
 from gyrofuse.mismatch.likelihoods.spectra.noise_parts import Ground
 from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios
 from gyrofuse.mismatch.likelihoods.spectra.starts import best_start
+from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Rival
 from gyrofuse.mismatch.mechanisms.spectra.findings import found, spanned
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import chosen_shape, refit
 from gyrofuse.mismatch.mechanisms.spectra.rivals import fit_alone
 from gyrofuse.mismatch.mechanisms.spectra.spectral import Addition
-from gyrofuse.mismatch.signals.comparison import Comparison
+from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
+from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import OfSensors
 
 
@@ -110,6 +113,55 @@ class AngleQuantization(Addition):
         own = self.variance[None]
         term = AngleNoise(own, own > 0, NO_SHARED)
         return replace(self, variance=refit(comparison, fold, term, self.company).local[0])
+
+
+@dataclass(frozen=True, eq=False)
+class AngleCounts(Mechanism):
+    """`y_t = q (round(A_t / q) - round(A_(t-1) / q))`, `A` the sum of `x`: the angle is counted, not the rate.
+
+    Attributes:
+        grid: The values' grid, of steps `q`.
+    """
+
+    name: ClassVar[str] = AngleQuantization.name
+    likelihood: ClassVar[str] = Quantization.likelihood
+    separated_by: ClassVar[str] = AngleQuantization.separated_by
+    stage: ClassVar[int] = Quantization.stage
+    grid: Quantization
+
+    @classmethod
+    def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
+        found, info = angle_counts(comparison, level), comparison.info
+        if not found:
+            return None
+        grid = Quantization.on(comparison, found)
+        sensors, unit = tuple(found), info.measure.removesuffix("/s") if info.measure.endswith("/s") else info.measure
+        parameters = grid.step_limits(comparison, found)
+        counts = sorted({float(f"{own.step / info.rate:.4g}") for own in found.values()})
+        return cls(grid).found(
+            f"{info.named(sensors, 'all sensors')} count an angle in steps of {counts[0]:.4g}"
+            + (f" to {counts[-1]:.4g}" if len(counts) > 1 else "")
+            + f" {unit}: values lie on a grid, and what rounding adds is gone from one sample to the next",
+            0.0,
+            sensors,
+            parameters,
+            levels=(1,),
+            gain=grid.log_ratio(comparison),
+        )
+
+    def fit_without(self, comparison: Comparison, fold: int) -> AngleCounts:
+        return replace(self, grid=self.grid.fit_without(comparison, fold))
+
+    def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
+        return self.grid.held_out_scores(comparison, fold)
+
+    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
+        self.grid.plot(comparison, ax, sensor=sensor, fitted=fitted)
+
+    def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
+        """From an angle of zero on; a grid of the recording has zero on it."""
+        step = self.grid.step
+        return torch.where(step[:, None] > 0, counted(signal, torch.where(step > 0, step, 1.0)), signal)
 
 
 def _profile(f: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar
@@ -17,6 +17,7 @@ from gyrofuse.mismatch.detectors.values.quantisation_grid import (
     exact_lattices,
     missing_lattices,
     off_lattice,
+    simulated_lattices,
 )
 from gyrofuse.mismatch.detectors.values.truncation import cut_off_gain
 from gyrofuse.mismatch.mechanisms import pictures
@@ -77,7 +78,10 @@ class Quantization(Mechanism):
         side, fine = comparison.reference, _undone(comparison)
         if not fine:
             return None
-        rows = [own if own is not None and i in fine else Lattice.none() for i, own in enumerate(exact_lattices(side))]
+        rows = [
+            own if own is not None and i in fine else Lattice.none()
+            for i, own in enumerate(simulated_lattices(comparison))
+        ]
         step, offset = torch.tensor([row[:2] for row in rows], dtype=torch.float64).mT
         return cls(step, offset, torch.zeros_like(step), side.signal.mean((0, -1)), cut_off=_any_cut_off(rows))
 
@@ -144,20 +148,13 @@ class Quantization(Mechanism):
         coarser = {i: own for i, own in coarser.items() if i in undone}
         if not found and not coarser:
             return None
-        every = range(comparison.n_sensors)
-        rows = [found.get(i, Lattice.none()) for i in every]
-        step, offset, blur = (torch.tensor([row[k] for row in rows], dtype=torch.float64) for k in range(3))
-        replaced = tuple(coarser.get(i, Lattice.none()).step for i in every) if coarser else ()
-        effect = cls(step, offset, blur, comparison.recording.mean(-1), replaced, _any_cut_off(rows))
-        effect = effect._placed(effect._values(comparison))
+        effect = cls.on(comparison, found, coarser)
+        step, blur = effect.step, effect.blur
         sensors = tuple(sorted({*found, *coarser}))
         parameters = {
             f"simulated_lsb[{i}]": Parameter.exact(own.step, comparison.info.measure) for i, own in coarser.items()
         }
-        for i in found:
-            value = float(step[i])
-            reach = Z * effect._step_sd(i, comparison.recording[i])
-            parameters[f"lsb[{i}]"] = Parameter.around(value, reach, comparison.info.measure)
+        parameters |= effect.step_limits(comparison, found)
         words = []
         if found:
             where = comparison.info.named(tuple(found), "all sensors")
@@ -187,9 +184,33 @@ class Quantization(Mechanism):
             sensors,
             parameters,
             levels=(1,),
-            gain=float(effect._scores(comparison).sum()),
+            gain=effect.log_ratio(comparison),
             hides=tuple(coarse),
         )
+
+    @classmethod
+    def on(
+        cls, comparison: Comparison, found: Mapping[int, Lattice], coarser: Mapping[int, Lattice] | None = None
+    ) -> Quantization:
+        """Grids of sensors, and those of the simulation that they take the place of, by position of the sensor."""
+        every, coarser = range(comparison.n_sensors), coarser or {}
+        rows = [found.get(i, Lattice.none()) for i in every]
+        step, offset, blur = (torch.tensor([row[k] for row in rows], dtype=torch.float64) for k in range(3))
+        replaced = tuple(coarser.get(i, Lattice.none()).step for i in every) if coarser else ()
+        effect = cls(step, offset, blur, comparison.recording.mean(-1), replaced, _any_cut_off(rows))
+        return effect._placed(effect._values(comparison))
+
+    def step_limits(self, comparison: Comparison, sensors: Iterable[int]) -> dict[str, Parameter]:
+        """Steps of some sensors as numbers of a finding."""
+        limits = {}
+        for i in sensors:
+            reach = Z * self._step_sd(i, comparison.recording[i])
+            limits[f"lsb[{i}]"] = Parameter.around(float(self.step[i]), reach, comparison.info.measure)
+        return limits
+
+    def log_ratio(self, comparison: Comparison) -> float:
+        """Log likelihood of all values over that of none on a grid, nats."""
+        return float(self._scores(comparison).sum())
 
     def fit_without(self, comparison: Comparison, fold: int) -> Quantization:
         return self._placed(self._values(comparison)[:, estimation_samples(comparison.n_samples, fold)])
@@ -247,7 +268,7 @@ class Quantization(Mechanism):
             return scores
         own = [
             Lattice.none() if not step or lattice is None else lattice
-            for step, lattice in zip(self.replaced, exact_lattices(comparison.reference), strict=True)
+            for step, lattice in zip(self.replaced, simulated_lattices(comparison), strict=True)
         ]
         step, offset = torch.tensor([lattice[:2] for lattice in own], dtype=torch.float64).mT
         cut = torch.tensor([lattice.cut_off is True for lattice in own])[:, None]
@@ -286,7 +307,7 @@ def _undone(comparison: Comparison) -> set[int]:
     change = side.signal.diff().square().mean((0, -1)).sqrt()
     spread = side.signal.var(-1).mean(0).sqrt()
     coarsest = torch.minimum(change / least_change, spread / least_spread)
-    lattices = exact_lattices(side)
+    lattices = simulated_lattices(comparison)
     return {i for i, own in enumerate(lattices) if own is not None and own.step < float(coarsest[i])}
 
 
