@@ -71,12 +71,15 @@ def _returns(side: Records, came: Records, longest: int) -> Tensor:
     A value that is met all over the record, as at an end stop or in the place of lost samples, does not count. Values
     on a fine grid are taken as they came; those on a coarse one meet by chance, and none of them counts.
     """
-    coarse = 1 / 8  # sd of a sample given its past
+    coarse, several = 1 / 8, 4.0  # sd of a sample given its past; times the usual value of a grid
     steps = torch.tensor([0.0 if own is None else own.step for own in exact_lattices(came)], dtype=torch.float64)
     rounded = (steps > 0)[:, None, None]
     signal = torch.where(rounded, came.signal.movedim(1, 0), side.signal.movedim(1, 0))
     _, number, counts = signal.unique(return_inverse=True, return_counts=True)
-    seldom = (counts[number] <= longest) | rounded
+    often = counts[number]
+    ends = (signal == signal.amax(-1, keepdim=True)) | (signal == signal.amin(-1, keepdim=True))
+    usual = torch.where(ends, torch.nan, often.to(torch.float64)).flatten(1).nanmedian(-1).values[:, None, None]
+    seldom = (often <= longest) | (rounded & (often <= several * usual))
     before = torch.nn.functional.pad(signal[..., 1:] == signal[..., :-1], (1, 0))
     found = []
     for lag in range(2, longest + 1):

@@ -17,12 +17,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.detectors.values.quantisation_grid import (
-    Lattice,
-    distinct_values,
-    exact_lattices,
-    simulated_lattices,
-)
+from gyrofuse.mismatch.detectors.values.quantisation_grid import Lattice, code_lattices, distinct_values
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.records import Records
@@ -48,14 +43,15 @@ class CodeMap(NamedTuple):
 def missing_codes(comparison: Comparison) -> dict[int, CodeMap]:
     """Codes that sensors of the recording do not put out, and the simulation's do, by position of the sensor."""
     found = {}
-    own, theirs = exact_lattices(comparison.as_came), simulated_lattices(comparison)
+    own, theirs = code_lattices(comparison.as_came), code_lattices(comparison.reference)
     for i, (lattice, other) in enumerate(zip(own, theirs, strict=True)):
         code_map = None if lattice is None else _code_map(comparison.as_came, i, lattice)
         if code_map is None:
             continue
         simulated = None if other is None else _shares(comparison.reference, i, other, len(code_map.shifts))
-        fewest = 0.3  # of the samples that a code has where none is missing
-        if simulated is None or float(simulated.min()) > fewest / len(simulated):
+        lost = torch.tensor(code_map.shifts) != 0
+        fewest = 0.3  # of the samples that these codes have where none is missing
+        if simulated is None or float(simulated[lost].sum()) > fewest * float(lost.double().mean()):
             found[i] = code_map
     return found
 
@@ -75,6 +71,27 @@ def _code_map(side: Records, sensor: int, lattice: Lattice) -> CodeMap | None:
         shifts = min(maps, key=lambda one: float((_shares_of(one) - shares).square().sum()))
         chance = -n / modulus * (1 - rare) ** 2 / 2  # nats, of so few (Chernoff)
         return CodeMap(shifts, maps[shifts], shares, modulus * math.exp(max(chance, -700.0)))
+    return _high_bit(side, sensor, lattice)
+
+
+def _high_bit(side: Records, sensor: int, lattice: Lattice) -> CodeMap | None:
+    """Of a stuck bit so high that single codes have few samples: half of all remainders in a row are missing."""
+    signal, rare = side.signal[0, sensor], 0.01  # of the samples
+    n, change = signal.shape[-1], float(signal.diff().square().mean().sqrt()) / lattice.step
+    for bit in range(3, 20):
+        half = 2**bit
+        if change < half / 2:  # what moves less from sample to sample may stay on one side
+            return None
+        shares = _shares(side, sensor, lattice, 2 * half)
+        windows = torch.cat([shares, shares[:-1]]).unfold(0, half, 1).sum(-1)[: 2 * half]
+        least = (windows <= windows.min()).nonzero()[:, 0]
+        if float(windows.min()) > rare or len(least) > half:
+            continue
+        lost = torch.zeros(2 * half, dtype=torch.bool)
+        lost[(torch.arange(half) + int(least[len(least) // 2])) % (2 * half)] = True
+        level = torch.where(lost, windows.min(), 1 - windows.min()) / half
+        chance = max(-n / 4 * (1 - 2 * rare) ** 2, -700.0)  # nats, of so few in one half (Chernoff)
+        return CodeMap(tuple(-half if one else 0 for one in lost.tolist()), bit, level, 2 * half * math.exp(chance))
     return None
 
 

@@ -118,7 +118,7 @@ def exact_lattices(side: Records) -> tuple[Lattice | None, ...]:
 
     Sensors of one step have one kind of converter: what is told of one of them holds for those of which it is not.
     """
-    found = [_exact_lattice(*v, float(sd)) for v, sd in zip(distinct_values(side), innovation_sd(side), strict=True)]
+    found = _exact_in(side, 1 / 50)
     told = [own for own in found if own is not None and own.cut_off is not None]
     for i, own in enumerate(found):
         if own is not None and own.cut_off is None and own.has_zero:
@@ -141,14 +141,25 @@ def simulated_lattices(comparison: Comparison) -> tuple[Lattice | None, ...]:
     return tuple(found)
 
 
-def _exact_lattice(unique: Tensor, counts: Tensor, sd: float) -> Lattice | None:
+@derived
+def code_lattices(side: Records) -> tuple[Lattice | None, ...]:
+    """The same down to steps that change nothing in the noise, as of converters of many bits, or of arithmetic."""
+    return tuple(_exact_in(side, 1 / 2000))
+
+
+def _exact_in(side: Records, finest: float) -> list[Lattice | None]:
+    """Exact grids of steps from so many sd of a sample given its past."""
+    least = finest * innovation_sd(side)
+    return [_exact_lattice(*v, float(step)) for v, step in zip(distinct_values(side), least, strict=True)]
+
+
+def _exact_lattice(unique: Tensor, counts: Tensor, finest: float) -> Lattice | None:
     """Grid on which 999 of 1000 samples lie to a hundredth of a step: converters also have end stops.
 
-    Its step is the usual or the smallest gap between values, but for those below a 50th of an sd: that is the noise of
-    arithmetic.
+    Its step is the usual or the smallest gap between values, but for finer ones: those are noise of arithmetic.
     """
     gaps = unique.diff()
-    wide = gaps[gaps >= sd / 50]
+    wide = gaps[gaps >= finest]
     for step in (float(wide.median()), float(wide.min())) if len(wide) > 1 else ():
         k = torch.cat([torch.zeros(1, dtype=torch.float64), (gaps / step).round().cumsum(0)])
         middle, mean = ((counts * v).sum() / counts.sum() for v in (k, unique))
@@ -157,7 +168,7 @@ def _exact_lattice(unique: Tensor, counts: Tensor, sd: float) -> Lattice | None:
         if float(counts[off.abs() < 0.01].sum() / counts.sum()) >= 0.999:
             offset = math.remainder(float(mean - middle * step), step)
             found = Lattice(step, offset, 0.0, 0.0)
-            told = found.has_zero and step < 3 * sd  # coarser ones are met by a bias that stays there
+            told = found.has_zero and step < 150 * finest  # coarser ones are met by a bias that stays there
             return found._replace(cut_off=is_cut_off(step_counts(unique, counts, step))) if told else found
     return None
 

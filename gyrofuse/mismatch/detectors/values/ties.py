@@ -129,8 +129,8 @@ def stands_alone(others: Tensor, value: float, times: int) -> bool:
     Tails fall: half a standard deviation before an end stop, and at the next value on a lattice, there are more values
     than beyond it.
     """
-    distance = (others - value).abs()
-    return float((distance <= max(float(others.std()) / 2, 1.5 * float(distance.min()))).sum()) < times / 4
+    distance, fewest = (others - value).abs(), 1 / 4 if times < len(others) / 2 else 1 / 8
+    return float((distance <= max(float(others.std()) / 2, 1.5 * float(distance.min()))).sum()) < fewest * times
 
 
 def missing_recurrences(comparison: Comparison) -> dict[int, tuple[Recurring, float]]:

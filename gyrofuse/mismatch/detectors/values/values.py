@@ -208,8 +208,16 @@ def end_stops(comparison: Comparison) -> tuple[EndStop, ...]:
             p = min(math.exp(-beyond), min(10.0 * max(near, resolution) / sd, 1.0) ** (runs - 1))
             if rounded:  # tails of rounded noise are not normal: chance has up to four at the end
                 p = max(p, float(special.pdtrc(runs - 1, 4.0)))
+            p = max(p, _as_next_to_it(sign * x, limit, resolution, int(at.sum())))
             found.append(EndStop(i, sign, sign * limit, sidak(p, 4 * comparison.n_sensors)))
     return tuple(found)
+
+
+def _as_next_to_it(x: Tensor, limit: float, step: float, times: int) -> float:
+    """p value of as many samples at the largest value as there are at those next to it, where values end at an edge."""
+    cells = 8
+    beside = int(((x < limit) & (x > limit - (cells + 0.5) * step)).sum())
+    return float(special.pdtrc(times - 1, beside / cells)) if beside else 0.0
 
 
 def _filled_in(comparison: Comparison, sensor: int, at: Tensor, far: float) -> bool:

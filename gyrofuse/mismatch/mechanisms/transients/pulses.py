@@ -57,7 +57,8 @@ class Pulses(Transient):
         p_value = pulse_p_value(comparison)
         if p_value > level:
             return None
-        pulses = _those_alone(comparison, _pulses(comparison))
+        shortest = 1.5  # samples: what is over sooner is a spike
+        pulses = [one for one in _those_alone(comparison, _pulses(comparison)) if one.pulse.width > shortest]
         pulses.sort(key=lambda one: -float(one.log_ratio.sum()))
         if not pulses or _to_and_fro(pulses) or _of_any_length(pulses):
             return None
@@ -67,10 +68,10 @@ class Pulses(Transient):
         effect, strongest = cls.of(pulses, comparison), pulses[0]
         around = _around(comparison, comparison.recording, strongest.pulse)
         width, often = strongest.pulse.width / rate, hourly(len(pulses), effect.duration_s)
-        shortest, longest = width_limits(around, strongest)
+        low, high = width_limits(around, strongest)
         parameters = {
             "rate": often,
-            "width": Parameter(width, shortest / rate, longest / rate, "s"),
+            "width": Parameter(width, low / rate, high / rate, "s"),
         }
         for i in strongest.amplitude.nonzero()[:, 0].tolist():
             value, reach = float(strongest.amplitude[i]), Z * float(strongest.sd[i])

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.detectors.values.missing_codes import missing_codes
-from gyrofuse.mismatch.detectors.values.quantisation_grid import exact_lattices
+from gyrofuse.mismatch.detectors.values.quantisation_grid import code_lattices
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
@@ -42,7 +42,7 @@ class MissingCodes(Mechanism):
         found = {i: one for i, one in missing_codes(comparison).items() if one.p_value <= level}
         if not found:
             return None
-        info, lattices = comparison.info, exact_lattices(comparison.as_came)
+        info, lattices = comparison.info, code_lattices(comparison.as_came)
         step, offset = torch.zeros(2, comparison.n_sensors, dtype=torch.float64)
         parameters = {}
         for i, one in found.items():
