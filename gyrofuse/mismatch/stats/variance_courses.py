@@ -13,10 +13,12 @@ from __future__ import annotations
 
 import itertools
 import math
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy import fft
 from torch import Tensor
 
 from gyrofuse.mismatch.decisions import NATS_PER_NUMBER
@@ -99,40 +101,59 @@ def course_of(white: Tensor, log_factor: Tensor) -> Course | None:
     )
 
 
-def _with_peak(white: Tensor, slope: Tensor) -> Course | None:
-    """The likeliest course to a peak at which each sensor is louder by so much, `(sensor,)`, up to a factor."""
+def waves_of(white: Tensor, log_factor: Tensor, weight: Tensor) -> tuple[Course, float] | None:
+    """The likeliest course of up to eight waves, and its score as `course_score` has it; as `course_of`.
+
+    Half waves are those of a cosine transform; each costs half the logarithm of the number of samples.
+    """
+    size, m, price = log_factor.abs().max(), _n_blocks(white.shape[-1]), math.log(white.shape[-1]) / 2
+    found = list[tuple[Course, float]]()
+    for half_waves in (4, 8, 16) if float(size) > 0 else ():
+        if 2 * half_waves > m:
+            break
+        course = _with_peak(white, log_factor / size, half_waves)
+        if course is not None:
+            found.append((course, course_score(white, course, weight) + 2 * math.log(m) - half_waves * price))
+    return max(found, key=lambda one: one[1], default=None)
+
+
+def _with_peak(white: Tensor, slope: Tensor, half_waves: int = 0) -> Course | None:
+    """The likeliest course to a peak at which each sensor is louder by so much, `(sensor,)`, up to a factor.
+
+    Or the likeliest one of so many half waves.
+    """
+    ordered = partial(_smoothed, half_waves=half_waves) if half_waves else _unimodal
     squares, n = white.square(), white.shape[-1]
     size, concerned = n // _n_blocks(n), slope != 0
     blocks = squares[:, : n // size * size].unflatten(-1, (-1, size))
     level = (blocks.median(-1).values / CHI2_MEDIAN).clamp(min=1e-12).log()
-    stairs = _unimodal((slope @ (level - level.mean(-1, keepdim=True)) / slope.square().sum()).numpy())
+    stairs = ordered((slope @ (level - level.mean(-1, keepdim=True)) / slope.square().sum()).numpy())
     rounds = 6
     course = None
     for number in range(rounds):
         if stairs.max() == stairs.min():
             return None
         pooled = stairs
-        if number:  # where the change is known
+        if number and not half_waves:  # where the change is known
             pooled = _without_end_spikes(stairs, size / 2 * float(slope.square().sum()))
         beyond = np.array([stairs.max() - pooled.max(), pooled.min() - stairs.min()]) / (pooled.max() - pooled.min())
         stairs = pooled
         stairs = (stairs - stairs.min()) / (stairs.max() - stairs.min())
         c = torch.from_numpy(stairs)
-        at, values = _knots(stairs)
+        at, values = (np.arange(len(stairs)) + 0.5, stairs) if half_waves else _knots(stairs)
         share = torch.from_numpy(np.interp(np.arange(n) + 0.5, size * np.array(at), values))
         base, slope, sd = fitted_levels(squares, share, concerned)
         # The course's own range is known from its highest and its lowest level alone, all sensors together; where it
         # ends between the pooled level and the spike is as likely anywhere.
-        ends = (
-            2 * sum(1 / (size * float((c == end).sum())) for end in (0.0, 1.0)) / slope.square().sum().clamp(min=1e-12)
-        )
+        blocks_at = [len(c) / half_waves] * 2 if half_waves else [float((c == end).sum()) for end in (0.0, 1.0)]
+        ends = 2 * sum(1 / (size * k) for k in blocks_at) / slope.square().sum().clamp(min=1e-12)
         sd = (sd.square() + slope.square() * (ends + float((beyond**2).sum()) / 12)).sqrt()
         course = Course(share, base.exp(), slope.exp(), sd)
         if number < rounds - 1:
             variance = (base[:, None] + slope[:, None] * c).exp()[..., None]
             excess = ((blocks / variance).clamp(max=OUTLIER) - 1).mean(-1)
             step = (slope @ excess / slope.square().sum().clamp(min=1e-12)).clamp(-_STEEPEST, _STEEPEST)
-            stairs = _unimodal((c + step / slope.abs().max().clamp(min=1.0)).numpy())
+            stairs = ordered((c + step / slope.abs().max().clamp(min=1.0)).numpy())
     return course
 
 
@@ -197,6 +218,13 @@ def _unimodal(values: np.ndarray) -> np.ndarray:
     ends = range(len(values) + 1)
     fits = (np.concatenate([_isotonic(values[:k]), _isotonic(values[k:][::-1])[::-1]]) for k in ends)
     return min(fits, key=lambda fit: float(((fit - values) ** 2).sum()))
+
+
+def _smoothed(values: np.ndarray, half_waves: int) -> np.ndarray:
+    """A sequence `(block,)` with the first terms of its cosine transform alone."""
+    terms = fft.dct(values, norm="ortho")
+    terms[half_waves + 1 :] = 0.0
+    return np.asarray(fft.idct(terms, norm="ortho"))
 
 
 def _isotonic(values: np.ndarray) -> np.ndarray:

@@ -61,6 +61,20 @@ class RingScan(NamedTuple):
         return math.exp(min(-self.log_ratio, 0.0))
 
 
+def in_another_order(white: Tensor) -> Tensor:
+    """Whitened samples `(sensor, time)`, of which those far apart become neighbours.
+
+    Nothing that lasts is left of them, and samples are large as often: chance, where noise is heavy-tailed.
+    """
+    stride = math.isqrt(white.shape[-1])
+    return white[:, : stride * stride].unflatten(-1, (stride, stride)).mT.flatten(1)
+
+
+def strongest_by_chance(scan: RingScan, disordered: RingScan) -> float:
+    """Log likelihood ratio that a cell of a scan has by chance: beside all others, and beside samples in disorder."""
+    return max(math.log(scan.n_cells), *(cell.log_ratio for cell in disordered.cells[:1]), -math.inf)
+
+
 def p_value_beside(own: RingScan, simulated: RingScan) -> float:
     """p value of a scan of the recording beside one of the simulation, which may ring itself."""
     strongest = torch.tensor([cell.log_ratio for cell in simulated.cells], dtype=torch.float64)

@@ -25,7 +25,14 @@ from torch import Tensor
 
 from gyrofuse._base.transforms import squared_modulus
 from gyrofuse.mismatch.decisions import CHANCE, NATS_AS_GOOD
-from gyrofuse.mismatch.detectors.lines.ring_cells import RingCell, RingScan, apart, irreversible, p_value_beside
+from gyrofuse.mismatch.detectors.lines.ring_cells import (
+    RingCell,
+    RingScan,
+    apart,
+    in_another_order,
+    irreversible,
+    p_value_beside,
+)
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.signals.comparison import Comparison
@@ -62,7 +69,15 @@ def ring_downs(comparison: Comparison) -> RingScan:
 def ring_down_p_value(comparison: Comparison) -> float:
     """p value of the recording's, by Ville's bound and beside the strongest cells of the simulation."""
     own = ring_downs(comparison)
-    return own.p_value if own.p_value > CHANCE else p_value_beside(own, _simulated(comparison))
+    if own.p_value > CHANCE:
+        return own.p_value
+    return max(p_value_beside(own, _simulated(comparison)), p_value_beside(own, disordered(comparison)))
+
+
+@derived
+def disordered(comparison: Comparison) -> RingScan:
+    """The same of the recording's samples in another order, of which none lasts."""
+    return scanned_ring_downs(in_another_order(comparison.lineless))
 
 
 @derived

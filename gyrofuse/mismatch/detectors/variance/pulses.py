@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.decisions import CHANCE, NATS_AS_GOOD
-from gyrofuse.mismatch.detectors.lines.ring_cells import RingCell, RingScan, apart, p_value_beside
+from gyrofuse.mismatch.detectors.lines.ring_cells import RingCell, RingScan, apart, in_another_order, p_value_beside
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.signals.comparison import Comparison
@@ -51,6 +51,12 @@ def pulses_of(comparison: Comparison) -> RingScan:
 
 
 @derived
+def disordered(comparison: Comparison) -> RingScan:
+    """The same of the recording's samples in another order, of which none lasts."""
+    return scanned_pulses(in_another_order(comparison.lineless))
+
+
+@derived
 def _simulated(comparison: Comparison) -> RingScan:
     return scanned_pulses(comparison.lineless_reference[0])
 
@@ -58,7 +64,9 @@ def _simulated(comparison: Comparison) -> RingScan:
 def pulse_p_value(comparison: Comparison) -> float:
     """p value of the recording's, by Ville's bound and beside the strongest of the simulation."""
     own = pulses_of(comparison)
-    return own.p_value if own.p_value > CHANCE else p_value_beside(own, _simulated(comparison))
+    if own.p_value > CHANCE:
+        return own.p_value
+    return max(p_value_beside(own, _simulated(comparison)), p_value_beside(own, disordered(comparison)))
 
 
 def scanned_pulses(white: Tensor) -> RingScan:

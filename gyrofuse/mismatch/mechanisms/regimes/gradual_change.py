@@ -41,6 +41,7 @@ from gyrofuse.mismatch.stats.variance_courses import (
     course_at_once,
     course_of,
     course_score,
+    waves_of,
 )
 
 _NATS = 5.0  # by which it has to be likelier than episodes with a start and a stop
@@ -54,8 +55,8 @@ _BEGUN = 0.05  # share of its way from which a course is said to have left its l
 class GradualChange(LevelCourse):
     """`S_t(f) = (1 + (base factor^c(t) - 1) f^2/(f^2 + f_c^2)) S(f)`: what is fast is louder by a course `c`.
 
-    The course rises to one peak and falls from it, either of which may be missing. A level that goes up and down more
-    often has no name here.
+    The course rises to one peak and falls from it, either of which may be missing, or takes some waves. A level that
+    goes up and down all the time has no name here.
 
     Attributes:
         time_s: Knots of the course, s after the first sample, `(knot,)`.
@@ -92,8 +93,13 @@ class GradualChange(LevelCourse):
             if not goes_up_and_down(comparison, episodes):
                 # A single one is a course as well: another that may be it has to gain more than orders do by chance.
                 once += 2 * math.log(comparison.n_samples)
+        waves = False
         if score < once + _NATS or _goes_up_and_down(comparison, course, score):
-            return None
+            several = waves_of(white, start.factor.log(), weight)
+            if several is None or several[1] < max(once, score) + _NATS or _goes_up_and_down(comparison, *several):
+                return None
+            waves, (course, _) = True, several
+            gain = float(weight @ course_scores(white, course.variance).sum(-1))
         peak = course.share > MOSTLY
         if bool(peak.all()) or not bool(peak.any()):
             return None
@@ -109,7 +115,7 @@ class GradualChange(LevelCourse):
             value, spread = float(factor[i]), math.exp(float(reach[i]))
             parameters[f"factor[{i}]"] = Parameter.within(value, spread, "")
         return effect.found(
-            _sentence(comparison, way, factor, sensors),
+            _sentence(comparison, None if waves else way, factor, sensors),
             p_value,
             sensors,
             parameters,
@@ -146,10 +152,14 @@ class _Way(NamedTuple):
         return cls((away[0], near[0]) if up else None, (near[-1], away[-1]) if down else None)
 
 
-def _sentence(comparison: Comparison, way: _Way, factor: Tensor, sensors: tuple[int, ...]) -> str:
+def _sentence(comparison: Comparison, way: _Way | None, factor: Tensor, sensors: tuple[int, ...]) -> str:
+    """Of what goes one way and perhaps back; None of what does so more often."""
     largest = max(sensors, key=lambda i: abs(math.log(float(factor[i]))))
     words: list[str] = []
     value = float(factor[largest])
+    if way is None:
+        words.append(f"up and down, by a factor of up to {max(value, 1 / value):.3g}")
+        way = _Way(None, None)
     for stretch, other in ((way.up, value), (way.down, 1 / value)):
         if stretch is not None:
             after = "back" if words else f"to {other:.3g} times what it was"

@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.decisions import NATS_AS_GOOD, NATS_PER_NUMBER
+from gyrofuse.mismatch.detectors.lines.ring_cells import strongest_by_chance
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
-from gyrofuse.mismatch.detectors.variance.pulses import pulse_p_value, pulses_of, scanned_pulses
+from gyrofuse.mismatch.detectors.variance.pulses import disordered, pulse_p_value, pulses_of, scanned_pulses
 from gyrofuse.mismatch.likelihoods.damped_tone import Surroundings
 from gyrofuse.mismatch.likelihoods.pulse import FittedPulse, Pulse, fitted_pulse, other_course, sized, width_limits
 from gyrofuse.mismatch.mechanisms import pictures
@@ -145,7 +146,8 @@ def _pulses(comparison: Comparison) -> list[FittedPulse]:
     slow = comparison.shortest_transient
     shared = torch.corrcoef(comparison.lineless.clamp(-4, 4)).view(comparison.n_sensors, -1)
     for _ in range(rounds):
-        doubtful, new, by_chance = list[FittedPulse](), list[FittedPulse](), math.log(scan.n_cells)
+        doubtful, new = list[FittedPulse](), list[FittedPulse]()
+        by_chance = strongest_by_chance(scan, disordered(comparison))
         for cell in scan.cells:
             if cell.log_ratio < by_chance or len(found) + len(new) >= most or len(doubtful) >= most_doubtful:
                 break
@@ -219,9 +221,10 @@ def _to_and_fro(pulses: Sequence[FittedPulse]) -> bool:
 
 def _of_any_length(pulses: Sequence[FittedPulse]) -> bool:
     """Whether stays are of any length, as those of what switches are: as exponential values are, or more."""
-    fewest, spread = 8, 0.9  # of the logarithms: of exponential values 1.28
+    fewest, spread = 8, 1.1  # between the quartiles of the logarithms: of exponential values 1.57
     widths = torch.tensor([one.pulse.width for one in pulses], dtype=torch.float64)
-    return len(widths) >= fewest and float(widths.log().std()) > spread
+    quartiles = widths.log().quantile(torch.tensor([0.25, 0.75], dtype=torch.float64))
+    return len(widths) >= fewest and float(quartiles.diff()) > spread
 
 
 def _around(comparison: Comparison, recording: Tensor, pulse: Pulse) -> Surroundings:

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.decisions import NATS_AS_GOOD, NATS_PER_NUMBER
-from gyrofuse.mismatch.detectors.lines.ring_downs import ring_down_p_value, ring_downs, scanned_ring_downs
+from gyrofuse.mismatch.detectors.lines.ring_cells import strongest_by_chance
+from gyrofuse.mismatch.detectors.lines.ring_downs import disordered, ring_down_p_value, ring_downs, scanned_ring_downs
 from gyrofuse.mismatch.detectors.moving.moving_lines import moving_line
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.likelihoods.damped_tone import DampedTone, FittedTone, Surroundings
@@ -191,7 +192,7 @@ def _tones(comparison: Comparison) -> list[FittedTone]:
     mostly = 0.8  # of the energy
     line = moving_line(comparison.observed)
     for _ in range(rounds):
-        new, by_chance, refused = list[FittedTone](), math.log(scan.n_cells), 0
+        new, by_chance, refused = list[FittedTone](), strongest_by_chance(scan, disordered(comparison)), 0
         least = by_chance + NATS_AS_GOOD
         for cell in scan.cells:
             if cell.log_ratio < by_chance or len(tones) + len(new) >= most or refused >= most_refused:
