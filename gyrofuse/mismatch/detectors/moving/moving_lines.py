@@ -124,7 +124,8 @@ def _powers(white: Tensor, length: int) -> Tensor:
     power = squared_modulus(torch.fft.rfft(segments * light_taper(length)))[..., _LOWEST:-1]
     for dim in (-2, -1):
         power = power / (power.median(dim, keepdim=True).values / math.log(2)).clamp(min=1e-300)
-    return power
+    there = (segments != 0).to(power.dtype).mean(-1, keepdim=True)  # of segments at the ends little is left
+    return torch.where(there > 0.5, power, 0.0)
 
 
 def _cell_ratios(power: Tensor) -> tuple[Tensor, Tensor]:

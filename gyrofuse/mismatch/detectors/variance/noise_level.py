@@ -156,6 +156,11 @@ def variance_p_value(comparison: Comparison) -> float:
     within = _averaged(comparison, lambda w: scanned_levels(squares, None, w).log_ratio)
     if gaussian:
         within = p_value_beyond_reference(within, _scanned(comparison.reference).p_value)
+    elif within <= CHANCE:  # a level that goes up and down with a period varies less in the long run than it does
+        theirs = _white(comparison.reference).flatten(0, 1).square().clamp(max=SQUARE_CUT)
+        times = len(theirs) // comparison.n_sensors
+        own = _averaged(comparison, lambda w: scanned_levels(theirs, None, w.repeat(times)).log_ratio)
+        within = min(within / own**1.5, 1.0) if own <= CHANCE else within  # half as much again is no chance
     compared = compared_levels(comparison)
     return sidak(min(within, 1.0 if compared is None else compared.p_value), 2)
 
