@@ -84,6 +84,21 @@ def predicted(side: Records, at: Tensor, generator: torch.Generator) -> Tensor:
     return torch.where(at, side.signal[0] - expected.correctable()[0] + noise, side.signal[0])
 
 
+def whitened_without(side: Records, off: Tensor) -> Tensor:
+    """The first record whitened as in `left_out`, with some samples `(sensor, time)` as all others predict them.
+
+    A whitened sample that is far off has more of it beside: where noise is slow, next to nothing is left of their sum,
+    and a gap in its place would be a slow pulse.
+    """
+    rows = []
+    for signal, own in zip(side.noise[0], torch.where(off, left_out(side).error[0], 0.0), strict=True):
+        _, white, leaks = _errors_of(signal - own)
+        rows.append(_mirrored(white) if bool(leaks) else white)
+    white = torch.stack(rows)
+    white = white / torch.as_tensor(side.level) ** 0.5 if side.loud else white
+    return white / clipped_sd(white)[..., None]
+
+
 def scaled_innovations(signal: Tensor, factors: Tensor) -> Tensor:
     """Signals `(..., time)` whose innovations were multiplied by factors `(..., time)`: of the same smooth spectrum.
 
@@ -212,12 +227,13 @@ def _interpolated(means: Tensor, ends: Tensor) -> Tensor:
 def _lines(y: Tensor, spectrum: Tensor) -> Tensor:
     """Ordinates `(..., k)` of lines, 5 sd above the spectrum, and of their skirts.
 
-    A stretch belongs to a line where one of eight ordinates does, at every width from four to either side on.
+    A stretch belongs to a line where one of eight ordinates is so far up, at any width from four to either side on:
+    skirts that fall as the square of the distance reach as far as that.
     """
-    lines = y.square() > 25.0 * spectrum
+    lines = off = y.square() > 25.0 * spectrum
     n, reach = y.shape[-1], 4
-    while reach < n // ENDS and bool((lines.sum(-1) > 1).any()):  # two neighbours at least make a skirt
-        total = pad(lines.cumsum(-1), (reach + 1, 0))
+    while reach < n // ENDS and bool((off.sum(-1) > 1).any()):  # two neighbours at least make a skirt
+        total = pad(off.cumsum(-1), (reach + 1, 0))
         total = torch.cat([total, total[..., -1:].expand(*total.shape[:-1], reach)], -1)  # windows end with the record
         lines = lines | (total[..., 2 * reach + 1 :] - total[..., :n] > (2 * reach + 1) / 8)
         reach *= 2

@@ -19,7 +19,7 @@ from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.likelihoods.spectra.coherence import decorrelated
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
-from gyrofuse.mismatch.signals.prediction_errors import ENDS, left_out
+from gyrofuse.mismatch.signals.prediction_errors import ENDS, left_out, whitened_without
 from gyrofuse.mismatch.signals.records import Records
 from gyrofuse.mismatch.stats.level_scan import local_level
 
@@ -77,7 +77,10 @@ def decorrelated_record(side: Records) -> Tensor:
     white = left_out(side).white[0]
     white = white / local_level(white).sqrt()
     off = white.abs() > far
-    white = torch.where(off, 0.0, white)
+    if bool(off.any()):
+        white = whitened_without(side, off)
+        white = white / local_level(white).sqrt()
+        white = torch.where(white.abs() > far, 0.0, white)
     n = white.shape[-1]
     transform = torch.fft.rfft(white)
     edges = [0, *(round(e * n / side.bands.n_samples) for e in side.bands.edges[1:-1]), transform.shape[-1]]
