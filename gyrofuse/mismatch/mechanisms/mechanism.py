@@ -53,6 +53,7 @@ class Mechanism:
         happened_once: Whether it belongs to a time of this recording, and is not expected in another one.
         of_samples: Whether it is taken off the simulation's samples, so that their noise is estimated without it.
         changes_noise: Whether it changes levels or spectra of noise, so that wrong numbers lead a simulation away.
+        sets_sizes: Whether it says how large lines of the simulation are in the end, whatever filters do to them.
         of_spectra: Whether it is found in spectra alone.
         broad: Whether its spectral width is that of noise, on which a spectral line may stand.
         identified: Whether it is physics with a name, and not what is left of a difference.
@@ -75,6 +76,7 @@ class Mechanism:
     happened_once: ClassVar[bool] = False
     of_samples: ClassVar[bool] = False
     changes_noise: ClassVar[bool] = False
+    sets_sizes: ClassVar[bool] = False
     of_spectra: ClassVar[bool] = False
     broad: ClassVar[bool] = False
     identified: ClassVar[bool] = True

@@ -40,6 +40,7 @@ def eliminate(
         Findings that stay, with their alternatives, and recording and simulation with all of them repaired.
     """
     swapped = renamed = False
+    selected, comparison = _sizes_last(selected, comparison, generator)
     while True:
         selected, comparison, without = _pruned(selected, comparison, generator)
         found = []
@@ -162,6 +163,24 @@ def _renamed(
                 break
         else:
             break
+    return selected, comparison
+
+
+def _sizes_last(
+    selected: list[Selected], comparison: Comparison, generator: torch.Generator
+) -> tuple[list[Selected], Comparison]:
+    """The findings with sizes of lines behind what changes noise: a filter found later changes lines as well."""
+    findings = [one.finding for one in selected]
+    noisy = [k for k, finding in enumerate(findings) if finding.effect.changes_noise]
+    early = [k for k, finding in enumerate(findings) if finding.effect.sets_sizes and noisy and k < noisy[-1]]
+    if not early:
+        return selected, comparison
+    first = early[0]
+    rest = [finding for k, finding in enumerate(findings) if k > first and k not in early]
+    selected, comparison = _repaired(selected[:first], rest, selected[first].before, generator)
+    for k in early:
+        if findings[k].effect.is_seen(comparison):
+            selected, comparison = _repaired(selected, [findings[k]], comparison, generator)
     return selected, comparison
 
 

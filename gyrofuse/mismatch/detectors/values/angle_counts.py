@@ -38,15 +38,23 @@ def angle_counts(comparison: Comparison, level: float) -> dict[int, Lattice]:
     bias = seen.mean(-1, keepdim=True) - simulated.mean(-1, keepdim=True)
     offset = torch.tensor([own.offset for own in found.values()], dtype=torch.float64)[:, None]
     rounded = ((simulated + bias - offset) / step[:, None]).round() * step[:, None]
-    better = _log_likelihood(seen, counted(simulated + bias, step)) - _log_likelihood(seen, rounded)
+    # Another level of white noise, as of dither, comes close to either.
+    white = torch.linspace(-0.8, 4.0, 25, dtype=torch.float64)[:, None] * step.square() / 12
+    better = _log_likelihood(seen, counted(simulated + bias, step), 0 * white[:1]) - _log_likelihood(
+        seen, rounded, white
+    )
     return {i: own for (i, own), nats in zip(found.items(), better.tolist(), strict=True) if nats > NATS_AS_GOOD}
 
 
-def _log_likelihood(seen: Tensor, simulated: Tensor) -> Tensor:
-    """Of the wavelet variances of samples `(sensor, time)`, chi squared about those of `(record, sensor, time)`."""
+def _log_likelihood(seen: Tensor, simulated: Tensor, white: Tensor) -> Tensor:
+    """Of the wavelet variances of samples `(sensor, time)`, chi squared about those of `(record, sensor, time)`.
+
+    The largest one for variances `(level, sensor)` of white noise in addition.
+    """
     n, fewest = seen.shape[-1], 32  # coefficients of a level that overlap nowhere
     n_levels = max(int(math.log2(min(n, simulated.shape[-1]) / fewest)), 1)
     expected = wavelet_variance(simulated, n_levels).mean(0)  # (level, sensor)
-    ratio = wavelet_variance(seen, n_levels) / expected.clamp(min=1e-300)
-    dof = n / 2.0 ** torch.arange(1, n_levels + 1, dtype=torch.float64)[:, None]
-    return (dof / 2 * (ratio.clamp(min=1e-300).log() - ratio)).sum(0)
+    scale = 2.0 ** torch.arange(1, n_levels + 1, dtype=torch.float64)[:, None]
+    expected = (expected + white[:, None] / scale).maximum(0.01 * expected).clamp(min=1e-300)
+    ratio = wavelet_variance(seen, n_levels) / expected
+    return (n / scale / 2 * (ratio.clamp(min=1e-300).log() - ratio)).sum(1).amax(0)

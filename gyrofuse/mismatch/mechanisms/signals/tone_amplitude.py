@@ -9,6 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.decisions import CERTAIN
 from gyrofuse.mismatch.detectors.lines.line_sizes import line_sizes
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.mechanisms import pictures
@@ -39,6 +40,7 @@ class ToneSize(Mechanism):
     name: ClassVar[str] = "parameter_shift"
     likelihood: ClassVar[str] = "known paths"
     separated_by: ClassVar[str] = "a longer recording, or one of the same device under other conditions"
+    sets_sizes: ClassVar[bool] = True
     frequency_hz: float
     amplitude: OfSensors
 
@@ -74,6 +76,13 @@ class ToneSize(Mechanism):
             gain=float(sizes.z[:, at].square().sum()) / 2,
         )
 
+    def is_seen(self, comparison: Comparison) -> bool:
+        """Whether a filter that was found later leaves the tone of another size."""
+        sizes = line_sizes(comparison)
+        if sizes is None:
+            return False
+        return float(sizes.tails[:, self._at(comparison)].min()) < CERTAIN / comparison.n_sensors
+
     @classmethod
     def fit_in_place_of(cls, finding: Finding, comparison: Comparison) -> Rival | None:
         return None  # stands for no other noise
@@ -102,8 +111,12 @@ class ToneSize(Mechanism):
         """Amplitude that the simulation has, `(sensor,)`."""
         sizes = line_sizes(comparison)
         assert sizes is not None
+        return sizes.reference[:, self._at(comparison)]
+
+    def _at(self, comparison: Comparison) -> int:
+        """Its place among the simulation's lines."""
         lines = torch.tensor(comparison.reference.lines, dtype=torch.float64)
-        return sizes.reference[:, int((lines - self.frequency_hz / comparison.info.rate).abs().argmin())]
+        return int((lines - self.frequency_hz / comparison.info.rate).abs().argmin())
 
     def _parts(self, comparison: Comparison, fold: int) -> Tensor:
         """Complex amplitudes `(sensor,)` in the samples that may be used for estimates."""
