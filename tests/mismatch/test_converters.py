@@ -15,9 +15,10 @@ from gyrofuse.mismatch.detectors.lines.ring_downs import ring_down_p_value
 from gyrofuse.mismatch.detectors.moving.chirps import decorrelated_record
 from gyrofuse.mismatch.detectors.moving.moving_lines import moving_line
 from gyrofuse.mismatch.detectors.values.angle_counts import angle_counts
+from gyrofuse.mismatch.detectors.values.lattices import exact_lattices, simulated_lattices
 from gyrofuse.mismatch.detectors.values.median_windows import median_windows
 from gyrofuse.mismatch.detectors.values.missing_codes import missing_codes
-from gyrofuse.mismatch.detectors.values.quantisation_grid import exact_lattices, missing_lattices, simulated_lattices
+from gyrofuse.mismatch.detectors.values.quantisation_grid import missing_lattices
 from gyrofuse.mismatch.detectors.values.sensor_gains import sensor_gains
 from gyrofuse.mismatch.detectors.values.values import end_stops, repeats
 from gyrofuse.mismatch.detectors.variance.pulses import pulse_p_value

@@ -10,7 +10,8 @@ from mismatch_draws import SCENE, drawn
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse.mismatch.detectors.values.quantisation_grid import exact_lattices, missing_lattices
+from gyrofuse.mismatch.detectors.values.lattices import exact_lattices
+from gyrofuse.mismatch.detectors.values.quantisation_grid import missing_lattices
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
 from gyrofuse.mismatch.signals.comparison import Comparison
 

@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.decisions import NATS_AS_GOOD
-from gyrofuse.mismatch.detectors.values.quantisation_grid import Lattice, missing_lattices
+from gyrofuse.mismatch.detectors.values.lattices import Lattice
+from gyrofuse.mismatch.detectors.values.quantisation_grid import missing_lattices
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.wavelets.covariance import wavelet_variance
 

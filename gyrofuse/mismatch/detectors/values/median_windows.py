@@ -11,7 +11,8 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from gyrofuse.mismatch.detectors.values.quantisation_grid import distinct_values, exact_lattices, innovation_sd
+from gyrofuse.mismatch.detectors.values.lattices import distinct_values, exact_lattices
+from gyrofuse.mismatch.detectors.values.quantisation_grid import core_sd
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.records import Records
@@ -44,6 +45,8 @@ def median_windows(comparison: Comparison) -> MedianWindows:
         return MedianWindows(none, none.to(torch.float64))
     sides = ((comparison.observed, comparison.as_came), (comparison.reference, comparison.reference))
     own, theirs = (_returns(side, came, 2 * longest) for side, came in sides)
+    coarse = torch.stack([_coarse(came) for _, came in sides]).any(0)[:, None]  # values of few digits meet by chance
+    own, theirs = (torch.where(coarse, 0, returns) for returns in (own, theirs))
     n, m = (side.signal[:, 0].numel() for side in (comparison.observed, comparison.reference))
     by_chance = own[:, longest:].to(torch.float64).mean(-1, keepdim=True)  # values of few digits meet at any distance
     own, theirs = own[:, : longest - 1], theirs[:, : longest - 1]
@@ -69,11 +72,10 @@ def _returns(side: Records, came: Records, longest: int) -> Tensor:
     """Samples that equal the one of a lag before but none between, for lags from 2 on, `(sensor, lag)`.
 
     A value that is met all over the record, as at an end stop or in the place of lost samples, does not count. Values
-    on a fine grid are taken as they came; those on a coarse one meet by chance, and none of them counts.
+    on a grid are taken as they came.
     """
-    coarse, several = 1 / 8, 4.0  # sd of a sample given its past; times the usual value of a grid
-    steps = torch.tensor([0.0 if own is None else own.step for own in exact_lattices(came)], dtype=torch.float64)
-    rounded = (steps > 0)[:, None, None]
+    several = 4.0  # times the usual value of a grid
+    rounded = (_steps(came) > 0)[:, None, None]
     signal = torch.where(rounded, came.signal.movedim(1, 0), side.signal.movedim(1, 0))
     _, number, counts = signal.unique(return_inverse=True, return_counts=True)
     often = counts[number]
@@ -86,4 +88,15 @@ def _returns(side: Records, came: Records, longest: int) -> Tensor:
         same = torch.nn.functional.pad(signal[..., lag:] == signal[..., :-lag], (lag, 0)) & ~before
         found.append((same & seldom).sum((1, 2)))
         before = before | same
-    return torch.where((steps > coarse * innovation_sd(came))[:, None], 0, torch.stack(found, -1))
+    return torch.stack(found, -1)
+
+
+def _coarse(came: Records) -> Tensor:
+    """Sensors whose grid is coarse beside their noise, `(sensor,)`."""
+    coarse = 1 / 8  # sd of a sample given its past
+    return _steps(came) > coarse * core_sd(came)
+
+
+def _steps(came: Records) -> Tensor:
+    """Steps of exact grids, `(sensor,)`; 0 without one."""
+    return torch.tensor([0.0 if own is None else own.step for own in exact_lattices(came)], dtype=torch.float64)

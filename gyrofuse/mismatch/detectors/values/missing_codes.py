@@ -17,7 +17,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.detectors.values.quantisation_grid import Lattice, code_lattices, distinct_values
+from gyrofuse.mismatch.detectors.values.lattices import Lattice, code_lattices, distinct_values
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.records import Records

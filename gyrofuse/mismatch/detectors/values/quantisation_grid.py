@@ -1,6 +1,6 @@
-"""The grid that rounded values lie on, exact or hidden under noise that was added after the rounding.
+"""Grids of the recording that the simulation lacks: exact ones, and those hidden under noise that was added later.
 
-A grid `offset + k step` is exact where values recur, and read off them. A hidden one shows in the empirical
+A hidden grid `offset + k step` shows in the empirical
 characteristic function `phi(u) = mean exp(i u x)` at `u = 2 pi/step`. That of noise, normal or a mixture of normal laws
 of several widths, falls all the way: at `u` it is not above the least that it is before, where a grid has a trough.
 With `b^2` the `n |phi|^2` there, `P = (sqrt(n) |phi| - b)^2` is at most standard exponential without a grid, by the
@@ -23,7 +23,15 @@ from torch import Tensor
 
 from gyrofuse._base.transforms import squared_modulus
 from gyrofuse.mismatch.decisions import CERTAIN, CHANCE
-from gyrofuse.mismatch.detectors.values.truncation import is_cut_off, step_counts
+from gyrofuse.mismatch.detectors.values.lattices import (
+    Lattice,
+    distinct_values,
+    exact_lattices,
+    grid_offset,
+    innovation_sd,
+    off_lattice,
+    simulated_lattices,
+)
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.prediction_errors import left_out
@@ -34,36 +42,6 @@ _FINEST_HIDDEN = 1 / 20  # smallest step, sd of a sample given its past: a finer
 _LOWEST = 3.5  # `u s`, from which on grids are searched: normal noise has n exp(-12) there, one in 10^5 samples
 _BEFORE = 0.8  # share of `u` up to which the least power before it is searched: nearer, a peak has its own flank
 _OF_OTHERS = 0.02  # p value of a grid at a step that another sensor is known to have
-
-
-class Lattice(NamedTuple):
-    """Values `offset + k step`, blurred by `blur` steps, sd.
-
-    Attributes:
-        step, offset: Unit of the signal.
-        blur: Standard deviation of what was added after the rounding, steps; 0 of an exact grid.
-        p_value: p value of continuous values, over every step.
-        peak: Frequency of the peak of the characteristic function, 0 where the grid is exact. Below `2 pi/step` if the
-            values spread over few steps, since what blurs the grid damps high frequencies more.
-        cut_off: Whether values are cut off towards zero, and not rounded; None where that cannot be told.
-    """
-
-    step: float
-    offset: float
-    blur: float
-    p_value: float
-    peak: float = 0.0
-    cut_off: bool | None = None
-
-    @property
-    def has_zero(self) -> bool:
-        """Whether zero is one of its points."""
-        return abs(self.offset) < 0.01 * self.step
-
-    @classmethod
-    def none(cls) -> Lattice:
-        """That of values without a grid."""
-        return cls(0.0, 0.0, 0.0, 1.0)
 
 
 class HiddenStep(NamedTuple):
@@ -85,12 +63,6 @@ class HiddenStep(NamedTuple):
         return p_value_from_e_value(self.log_ratio)
 
 
-def innovation_sd(side: Records) -> Tensor:
-    """Standard deviation of a sample given its past, `exp(integral log S)^(1/2)` (Kolmogorov), `(sensor,)`."""
-    width = torch.tensor(side.bands.edges, dtype=torch.float64).diff()
-    return ((side.power.log() * width).sum(-1) / width.sum() / 2).exp()
-
-
 @derived
 def core_sd(side: Records) -> Tensor:
     """Standard deviation of the middle of what the past and the other sensors leave of a sample, `(sensor,)`.
@@ -104,78 +76,6 @@ def core_sd(side: Records) -> Tensor:
     ridge = 1e-9 * torch.eye(len(white), dtype=white.dtype)  # of sensors that are copies of each other
     own = torch.linalg.inv(correlation + ridge).diagonal().rsqrt()
     return innovation_sd(side) / rms.clamp(min=1.0) * own.clamp(max=1.0)
-
-
-@derived
-def distinct_values(side: Records) -> tuple[tuple[Tensor, Tensor], ...]:
-    """Distinct values of each sensor in the first record, sorted, and how often each is there."""
-    return tuple(torch.unique(row, return_counts=True) for row in side.signal[0])
-
-
-@derived
-def exact_lattices(side: Records) -> tuple[Lattice | None, ...]:
-    """The exact grid of each sensor's values in the first record, `None` without.
-
-    Sensors of one step have one kind of converter: what is told of one of them holds for those of which it is not.
-    """
-    found = _exact_in(side, 1 / 50)
-    told = [own for own in found if own is not None and own.cut_off is not None]
-    for i, own in enumerate(found):
-        if own is not None and own.cut_off is None and own.has_zero:
-            alike = {other.cut_off for other in told if abs(other.step / own.step - 1) < 1e-3}
-            found[i] = own._replace(cut_off=alike.pop()) if len(alike) == 1 else own
-    return tuple(found)
-
-
-@derived
-def simulated_lattices(comparison: Comparison) -> tuple[Lattice | None, ...]:
-    """The exact grids of the simulation, with those of the recording that are too fine to be seen in its own noise."""
-    side = comparison.reference
-    found = list(exact_lattices(side))
-    for i, own in enumerate(exact_lattices(comparison.as_came)):
-        if own is not None and found[i] is None:
-            values = side.signal[0, i]
-            offset = _offset(values, own.step)
-            if float((off_lattice(values, own.step, offset).abs() < 0.01).to(torch.float64).mean()) >= 0.999:
-                found[i] = own._replace(offset=offset)
-    return tuple(found)
-
-
-@derived
-def code_lattices(side: Records) -> tuple[Lattice | None, ...]:
-    """The same down to steps that change nothing in the noise, as of converters of many bits, or of arithmetic."""
-    return tuple(_exact_in(side, 1 / 2000))
-
-
-def _exact_in(side: Records, finest: float) -> list[Lattice | None]:
-    """Exact grids of steps from so many sd of a sample given its past."""
-    least = finest * innovation_sd(side)
-    return [_exact_lattice(*v, float(step)) for v, step in zip(distinct_values(side), least, strict=True)]
-
-
-def _exact_lattice(unique: Tensor, counts: Tensor, finest: float) -> Lattice | None:
-    """Grid on which 999 of 1000 samples lie to a hundredth of a step: converters also have end stops.
-
-    Its step is the usual or the smallest gap between values, but for finer ones: those are noise of arithmetic.
-    """
-    gaps = unique.diff()
-    wide = gaps[gaps >= finest]
-    for step in (float(wide.median()), float(wide.min())) if len(wide) > 1 else ():
-        k = torch.cat([torch.zeros(1, dtype=torch.float64), (gaps / step).round().cumsum(0)])
-        middle, mean = ((counts * v).sum() / counts.sum() for v in (k, unique))
-        step = float((counts * (k - middle) * (unique - mean)).sum() / (counts * (k - middle).square()).sum())
-        off = (unique - mean) / step - (k - middle)
-        if float(counts[off.abs() < 0.01].sum() / counts.sum()) >= 0.999:
-            offset = math.remainder(float(mean - middle * step), step)
-            found = Lattice(step, offset, 0.0, 0.0)
-            told = found.has_zero and step < 150 * finest  # coarser ones are met by a bias that stays there
-            return found._replace(cut_off=is_cut_off(step_counts(unique, counts, step))) if told else found
-    return None
-
-
-def _offset(values: Tensor, step: float) -> float:
-    """Where a grid of a known step lies."""
-    return float(torch.exp(2j * math.pi / step * values).mean().angle()) / (2 * math.pi) * step
 
 
 def _hidden_step(rows: list[Tensor], sd: Tensor) -> HiddenStep:
@@ -282,13 +182,7 @@ def _lattice_at(unique: Tensor, peak: float, step: float) -> Lattice:
     power = float(_power(unique, torch.tensor([peak], dtype=torch.float64)))
     resultant = math.sqrt(max((power - 1) / (n - 1), 1e-12)) if n > 1 else 1e-6
     blur = math.sqrt(-2 * math.log(min(resultant, 1 - 1e-12))) / (2 * math.pi)
-    return Lattice(step, _offset(unique, step), blur, math.exp(-_power_beyond([unique], peak)), peak)
-
-
-def off_lattice(values: Tensor, step: float | Tensor, offset: float | Tensor) -> Tensor:
-    """Distances of values from the nearest point of a grid, steps."""
-    place = (values - offset) / step
-    return place - place.round()
+    return Lattice(step, grid_offset(unique, step), blur, math.exp(-_power_beyond([unique], peak)), peak)
 
 
 class Missing(NamedTuple):
@@ -349,7 +243,7 @@ def _too_coarse(comparison: Comparison, sensor: int, own: Lattice | None, other:
     if other.step < coarse * float(innovation_sd(comparison.reference)[sensor]):
         return False
     values = comparison.as_came.signal[0, sensor]
-    off = off_lattice(values, other.step, _offset(values, other.step))
+    off = off_lattice(values, other.step, grid_offset(values, other.step))
     if float((off.abs() < 0.01).to(torch.float64).mean()) > on:
         return False
     if own is not None:

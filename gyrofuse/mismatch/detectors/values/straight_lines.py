@@ -8,7 +8,7 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from gyrofuse.mismatch.detectors.values.quantisation_grid import exact_lattices
+from gyrofuse.mismatch.detectors.values.lattices import exact_lattices
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.records import Records

@@ -15,7 +15,7 @@ from scipy import stats
 from torch import Tensor
 
 from gyrofuse.mismatch.decisions import CERTAIN
-from gyrofuse.mismatch.detectors.values.quantisation_grid import distinct_values
+from gyrofuse.mismatch.detectors.values.lattices import distinct_values
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.records import Records

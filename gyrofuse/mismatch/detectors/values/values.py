@@ -12,8 +12,9 @@ from torch import Tensor
 
 from gyrofuse.mismatch.decisions import CERTAIN, CHANCE
 from gyrofuse.mismatch.detectors.result import TestResult
+from gyrofuse.mismatch.detectors.values.lattices import distinct_values, exact_lattices
 from gyrofuse.mismatch.detectors.values.missing_codes import missing_codes
-from gyrofuse.mismatch.detectors.values.quantisation_grid import distinct_values, exact_lattices, missing_lattices
+from gyrofuse.mismatch.detectors.values.quantisation_grid import missing_lattices
 from gyrofuse.mismatch.detectors.values.straight_lines import straight_lines
 from gyrofuse.mismatch.detectors.values.ties import missing_recurrences, stands_alone
 from gyrofuse.mismatch.signals.comparison import Comparison
@@ -208,16 +209,20 @@ def end_stops(comparison: Comparison) -> tuple[EndStop, ...]:
             p = min(math.exp(-beyond), min(10.0 * max(near, resolution) / sd, 1.0) ** (runs - 1))
             if rounded:  # tails of rounded noise are not normal: chance has up to four at the end
                 p = max(p, float(special.pdtrc(runs - 1, 4.0)))
-            p = max(p, _as_next_to_it(sign * x, limit, resolution, int(at.sum())))
+            p = max(p, _as_next_to_it(sign * x, limit, resolution, sd))
             found.append(EndStop(i, sign, sign * limit, sidak(p, 4 * comparison.n_sensors)))
     return tuple(found)
 
 
-def _as_next_to_it(x: Tensor, limit: float, step: float, times: int) -> float:
-    """p value of as many samples at the largest value as there are at those next to it, where values end at an edge."""
-    cells = 8
+def _as_next_to_it(x: Tensor, limit: float, step: float, sd: float) -> float:
+    """p value of as many samples at the largest value as there are at those next to it, where values end at an edge.
+
+    Of steps so small that the noise's density is about the same at all of these.
+    """
+    most, near = 8, 0.3  # steps; sd of the noise
+    cells = min(most, int(near * sd / step)) if step > 0 else 0
     beside = int(((x < limit) & (x > limit - (cells + 0.5) * step)).sum())
-    return float(special.pdtrc(times - 1, beside / cells)) if beside else 0.0
+    return float(special.pdtrc(int((x == limit).sum()) - 1, beside / cells)) if beside else 0.0
 
 
 def _filled_in(comparison: Comparison, sensor: int, at: Tensor, far: float) -> bool:

@@ -8,8 +8,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.detectors.values.lattices import code_lattices
 from gyrofuse.mismatch.detectors.values.missing_codes import missing_codes
-from gyrofuse.mismatch.detectors.values.quantisation_grid import code_lattices
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism

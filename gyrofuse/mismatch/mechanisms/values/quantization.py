@@ -11,14 +11,14 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.detectors.values.quantisation_grid import (
+from gyrofuse.mismatch.detectors.values.lattices import (
     Lattice,
     distinct_values,
     exact_lattices,
-    missing_lattices,
     off_lattice,
     simulated_lattices,
 )
+from gyrofuse.mismatch.detectors.values.quantisation_grid import missing_lattices
 from gyrofuse.mismatch.detectors.values.truncation import cut_off_gain
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
