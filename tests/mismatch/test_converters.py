@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -133,6 +134,17 @@ def test_a_filter_of_many_taps_turns_no_sensor_round() -> None:
     found = sensor_gains(compared(turned, simulation))
     assert found is not None
     assert found.factor.sign().tolist() == [1.0, -1.0, 1.0]
+
+
+@pytest.mark.parametrize("seed", range(40, 52))
+def test_sensors_that_share_nothing_have_no_sign(seed: int) -> None:
+    """Beside others that do: what their cross-spectra show is chance, however many bands there are of it."""
+    gain = torch.tensor([0.8, 0.7, 0.6, 0.0, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64)[:, None]
+    info = replace(SCENE, sensors=tuple("12345678"))
+    both = (normal(one, 8, 8192) + gain * normal(one + 100, 1, 8192) for one in (seed, seed + 1000))
+    recording, simulation = both
+    found = sensor_gains(Comparison.of(info, recording, simulation[None]))
+    assert found is None or float(found.factor.min()) > 0
 
 
 def test_a_level_that_goes_up_and_down_a_few_times_is_a_course() -> None:

@@ -89,7 +89,8 @@ def phases_of(comparison: Comparison, blocks: Tensor, shared: float = 0.5) -> Ph
     known = plain & (off.abs().amax((-1, -2)) > by_chance.clamp(min=shared))
     if not bool(known.any()):
         return None
-    inverse = torch.linalg.inv(c[known] + floor * torch.eye(p, dtype=c.dtype))
+    linked = _linked(off[known], ordinates[known])
+    inverse = torch.linalg.inv(torch.where(linked, c[known], 0.0) + floor * torch.eye(p, dtype=c.dtype))
     # The simulation's matrices scatter as well.
     count = d * ordinates / (d + ordinates).clamp(min=1e-300)
     density = reference_noise(comparison).spectrum(both.bands.nodes).mean(0)
@@ -102,6 +103,18 @@ def phases_of(comparison: Comparison, blocks: Tensor, shared: float = 0.5) -> Ph
         ratio[plain],
         (2 * apart[plain] + floor) / count[plain],
     )
+
+
+def _linked(coherence: Tensor, ordinates: Tensor) -> Tensor:
+    """Which sensors share anything with each other, or with one that does, `(sensor, sensor)`, in some bands together.
+
+    Small coherences of the others are chance, and so would be the phases that these are weighed with.
+    """
+    sure = 5.0  # standard deviations
+    count, p = len(coherence), coherence.shape[-1]
+    power = (ordinates[:, None, None] * coherence.abs().square()).sum(0)  # each exponential by chance
+    linked = (power > count + sure * (1 + math.sqrt(count))).to(torch.float64) + torch.eye(p, dtype=torch.float64)
+    return torch.linalg.matrix_power(linked, p) > 0
 
 
 def fitted_delays(phases: Phases) -> Delays:
