@@ -118,11 +118,17 @@ def strongest_slip(comparison: Comparison) -> Slip | None:
     """The most likely slip of any tone that the recording shares with the simulation, or that is new and steady."""
     block = comparison.n_samples // BLOCKS
     lines, found = simulated_lines(comparison.reference), comparison.line
-    shared = [f for f in lines if f * block >= 1 and not _rings(comparison, f)]  # a cycle in a block, or more
+    slowest = 1 / block  # a cycle in a block, or more
+    shared = [f for f in lines if f >= slowest and not _rings(comparison, f) and _in_both(comparison, f)]
     tones = [f for f in shared if not _elsewhere(comparison, f)][:3]
     if found.p_value < CERTAIN and found.frequency * block >= 1 and _steady(comparison, found.frequency):
         tones.append(found.frequency)
-    simulated = [slip for f in shared[:3] if (slip := _from_simulated(comparison, f)) is not None]
+    simulated = [
+        replace(slip, gain=slip.gain / alike, log_ratio=slip.log_ratio / alike, skew_sd=slip.skew_sd * math.sqrt(alike))
+        for f in shared[:3]
+        if (slip := _from_simulated(comparison, f)) is not None
+        for alike in (_alike(comparison, f),)
+    ]
     if not tones and not simulated:
         return None
     apart = 4 / comparison.n_samples  # a tone that fades is wider than a bin, and its skirts are no other lines
@@ -163,6 +169,23 @@ def _from_simulated(comparison: Comparison, f: float) -> Slip | None:
         e_value_of(math.erfc(abs(z) / math.sqrt(2))),
         SIMULATION,
     )
+
+
+def _in_both(comparison: Comparison, f: float) -> bool:
+    """Whether a tone of the simulation is in the recording: what noise is left there in common has a phase as well."""
+    least = 0.02  # of its power
+    signal = comparison.reference.signal[0]
+    theirs = _power_and_energy(demodulated(whitened(signal, comparison.base), f))[0].clamp(min=0).sum()
+    own = _power_and_energy(demodulated(comparison.white, f))[0].clamp(min=0).sum()
+    return float(own / comparison.n_samples) > least * float(theirs / signal.shape[-1])
+
+
+def _alike(comparison: Comparison, f: float) -> float:
+    """How many sensors count as one by the noise that they share in bands beside `f`: all have one path of phase."""
+    beside = 2  # bands on either side
+    coherence, at = comparison.reference.coherence, int((comparison.bands.frequency - f).abs().argmin())
+    around = torch.cat([coherence[max(at - beside, 0) : at], coherence[at + 1 : at + 1 + beside]])
+    return float(torch.linalg.eigvalsh(around.mean(0).abs())[-1]) if len(around) else 1.0
 
 
 def _lost_by_all(z: Tensor, f: float, block: int, least: float) -> Slip | None:
