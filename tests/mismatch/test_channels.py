@@ -364,3 +364,19 @@ def test_what_no_sensor_has_is_no_coupling(mechanism: type[ChannelGain], beyond:
         assert ("this is no " in finding.sentence) != possible
         assert finding.sensors == (0, 1)
         assert isinstance(finding.effect, mechanism)
+
+
+def test_an_axis_along_which_nothing_moves_is_no_part_of_a_gain():
+    """Of its gain nothing is known but an error, which would be most of the length of all three."""
+    g = generator(31)
+    rate = torch.stack(
+        [30 * gf.AR1(0.99, 1e-2).simulate(N, generator=g), *gf.WhiteNoise(1e-6).simulate(N, batch=(2,), generator=g)]
+    )
+    gains = torch.zeros(4, 3, dtype=torch.float64)
+    gains[1, 0] = -0.03
+    found = ScaleFactor.detect_and_fit(comparison(g, gains @ rate, angular_rate=rate), LEVEL)
+    assert found is not None
+    _, low, high, unit = found.parameters["error[1]"]
+    assert unit == "ppm"
+    assert low < -0.03e6 < high
+    assert high - low < 0.002e6

@@ -226,8 +226,15 @@ def _cost(fit: ChannelFit, n_samples: int) -> float:
 
 
 def _size(fit: ChannelFit, sensor: int, unit: str, factor: float) -> Parameter:
-    """A sensor's gain with its sign, or the length of its vector of gains, with limits."""
+    """A sensor's gain with its sign, or the length of its vector of gains, with limits.
+
+    Of an axis along which next to nothing moves no gain is known: the length would be that of its error.
+    """
     gains, covariance = factor * fit.gains[sensor], factor**2 * fit.covariance[sensor, :, sensor]
+    still, sure = 5.0, 4.0  # times the error of the axis that is known best; standard deviations
+    sd = covariance.diagonal().sqrt()
+    known = (sd < still * sd.min()) | (gains.abs() > sure * sd)
+    gains, covariance = gains[known], covariance[known][:, known]
     size = float(gains[0] if len(gains) == 1 else gains.norm())
     direction = gains / max(abs(size), 1e-300)
     reach = Z * math.sqrt(float(direction @ covariance @ direction))
