@@ -74,13 +74,17 @@ def strongest_by_chance(scan: RingScan, disordered: RingScan) -> float:
     return max(math.log(scan.n_cells), *(cell.log_ratio for cell in disordered.cells[:1]), -math.inf)
 
 
-def p_value_beside(own: RingScan, simulated: RingScan) -> float:
-    """p value of a scan of the recording beside one of the simulation, which may ring itself."""
-    strongest = torch.tensor([cell.log_ratio for cell in simulated.cells], dtype=torch.float64)
-    largest = torch.tensor(sorted((cell.log_ratio for cell in own.cells), reverse=True), dtype=torch.float64)
-    times_as_many = own.n_cells / max(simulated.n_cells, 1)
+def p_value_beside(own: RingScan, simulated: RingScan, disordered: RingScan) -> float:
+    """p value of a scan of the recording beside one of the simulation, which may ring itself, and of its disorder."""
     beyond_all = p_value_beyond_reference(own.p_value, simulated.p_value)
-    return max(beyond_all, p_value_beyond_largest(largest, strongest, times_as_many))
+    return max(beyond_all, p_value_beyond_cells(own, simulated), p_value_beyond_cells(own, disordered))
+
+
+def p_value_beyond_cells(own: RingScan, other: RingScan) -> float:
+    """p value of a scan's likeliest cells beside those of another one."""
+    strongest = torch.tensor([cell.log_ratio for cell in other.cells], dtype=torch.float64)
+    largest = torch.tensor(sorted((cell.log_ratio for cell in own.cells), reverse=True), dtype=torch.float64)
+    return p_value_beyond_largest(largest, strongest, own.n_cells / max(other.n_cells, 1))
 
 
 def apart(cells: Sequence[RingCell]) -> Iterator[RingCell]:

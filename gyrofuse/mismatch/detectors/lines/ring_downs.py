@@ -71,7 +71,7 @@ def ring_down_p_value(comparison: Comparison) -> float:
     own = ring_downs(comparison)
     if own.p_value > CHANCE:
         return own.p_value
-    return max(p_value_beside(own, _simulated(comparison)), p_value_beside(own, disordered(comparison)))
+    return p_value_beside(own, _simulated(comparison), disordered(comparison))
 
 
 @derived

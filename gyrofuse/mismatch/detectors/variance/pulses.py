@@ -66,7 +66,7 @@ def pulse_p_value(comparison: Comparison) -> float:
     own = pulses_of(comparison)
     if own.p_value > CHANCE:
         return own.p_value
-    return max(p_value_beside(own, _simulated(comparison)), p_value_beside(own, disordered(comparison)))
+    return p_value_beside(own, _simulated(comparison), disordered(comparison))
 
 
 def scanned_pulses(white: Tensor) -> RingScan:
