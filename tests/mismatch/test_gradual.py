@@ -132,10 +132,21 @@ def test_an_episode_is_none(louder: float):
 
 
 @pytest.mark.parametrize("depth", [0.3, 1.0, 3.0])
-def test_a_level_that_goes_up_and_down_has_no_course(depth: float):
-    wave = 0.5 * torch.sin(2 * math.pi * 3.3 * T) + 0.2 * torch.sin(2 * math.pi * 7.1 * T)
+def test_a_level_that_goes_up_and_down_all_the_time_has_no_course(depth: float):
+    wave = 0.5 * torch.sin(2 * math.pi * 33.3 * T) + 0.2 * torch.sin(2 * math.pi * 71.1 * T)
     comparison, _ = case_of(depth * wave, 7)
     assert GradualChange.detect_and_fit(comparison, LEVEL) is None
+
+
+@pytest.mark.parametrize("depth", [1.0, 3.0])
+def test_a_level_that_goes_up_and_down_a_few_times_has_one(depth: float):
+    wave = 0.5 * torch.sin(2 * math.pi * 3.3 * T) + 0.2 * torch.sin(2 * math.pi * 7.1 * T)
+    comparison, _ = case_of(depth * wave, 7)
+    found = GradualChange.detect_and_fit(comparison, LEVEL)
+    assert found is not None
+    assert "up and down" in found.sentence
+    course = found.effect.course(comparison.n_samples, comparison.info).variance[found.sensors[0]].log()
+    assert float(torch.corrcoef(torch.stack([course, wave]))[0, 1]) > 0.95
 
 
 def test_nothing_is_found_where_nothing_changes():

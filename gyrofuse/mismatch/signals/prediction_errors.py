@@ -91,12 +91,19 @@ def whitened_without(side: Records, off: Tensor) -> Tensor:
     and a gap in its place would be a slow pulse.
     """
     rows = []
-    for signal, own in zip(side.noise[0], torch.where(off, left_out(side).error[0], 0.0), strict=True):
-        _, white, leaks = _errors_of(signal - own)
+    for signal, at in zip(side.noise[0], off, strict=True):
+        _, white, leaks = _errors_of(signal - torch.where(at, _single(signal), 0.0))
         rows.append(_mirrored(white) if bool(leaks) else white)
     white = torch.stack(rows)
     white = white / torch.as_tensor(side.level) ** 0.5 if side.loud else white
     return white / clipped_sd(white)[..., None]
+
+
+def _single(signal: Tensor) -> Tensor:
+    """What a single sample `(time,)` would have to be less to leave the whitened signal with the least energy."""
+    y = torch.from_numpy(fft.dct(signal.numpy(), norm="ortho"))[1:]
+    inverse = 1 / _smooth_spectrum(y)[0]
+    return _inverse_dct(y * inverse) / inverse.mean()
 
 
 def scaled_innovations(signal: Tensor, factors: Tensor) -> Tensor:
