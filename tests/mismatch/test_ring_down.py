@@ -13,7 +13,7 @@ from scipy import signal
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse.mismatch.detectors.lines.ring_cells import p_value_beside
+from gyrofuse.mismatch.detectors.lines.ring_cells import in_another_order, p_value_beside
 from gyrofuse.mismatch.detectors.lines.ring_downs import ring_down_test, scanned_ring_downs
 from gyrofuse.mismatch.likelihoods.damped_tone import DampedTone, Surroundings
 from gyrofuse.mismatch.mechanisms.transients.ring_down import RingDown
@@ -66,8 +66,11 @@ def test_noise_of_both_that_is_heavy_tailed_or_wanders_rings_no_more_often(kind:
         course = signal.lfilter([math.sqrt(1 - steadiness**2)], [1, -steadiness], normal(p, n, g=g).numpy())
         return normal(p, n, g=g) * torch.from_numpy(course / 2).exp()
 
-    scans = [scanned_ring_downs(drawn()) for _ in range(n_runs)]
-    p_values = [p_value_beside(own, other) for own in scans for other in scans if own is not other]
+    records = [drawn() for _ in range(n_runs)]
+    scans = [(scanned_ring_downs(one), scanned_ring_downs(in_another_order(one))) for one in records]
+    p_values = [
+        p_value_beside(own, other, disordered) for own, disordered in scans for other, _ in scans if own is not other
+    ]
     assert sum(p < 0.01 for p in p_values) <= 0.02 * len(p_values)
     assert min(p_values) > 1e-4
 
