@@ -15,6 +15,7 @@ from gyrofuse.mismatch.detectors.lines.ring_cells import in_another_order
 from gyrofuse.mismatch.detectors.lines.ring_downs import ring_down_p_value
 from gyrofuse.mismatch.detectors.moving.chirps import decorrelated_record
 from gyrofuse.mismatch.detectors.moving.moving_lines import moving_line
+from gyrofuse.mismatch.detectors.spectra.delays import sensor_delays
 from gyrofuse.mismatch.detectors.values.angle_counts import angle_counts
 from gyrofuse.mismatch.detectors.values.lattices import exact_lattices, simulated_lattices
 from gyrofuse.mismatch.detectors.values.median_windows import median_windows
@@ -143,8 +144,33 @@ def test_sensors_that_share_nothing_have_no_sign(seed: int) -> None:
     info = replace(SCENE, sensors=tuple("12345678"))
     both = (normal(one, 8, 8192) + gain * normal(one + 100, 1, 8192) for one in (seed, seed + 1000))
     recording, simulation = both
-    found = sensor_gains(Comparison.of(info, recording, simulation[None]))
+    comparison = Comparison.of(info, recording, simulation[None])
+    found = sensor_gains(comparison)
     assert found is None or float(found.factor.min()) > 0
+    delays = sensor_delays(comparison)
+    assert delays is None or bool((delays.delay.abs() < 4 * delays.sd).all())
+
+
+def test_two_groups_that_share_noise_have_delays_of_their_own() -> None:
+    """What lies between the groups is not known, nor is any delay of a sensor that shares nothing."""
+    group = torch.zeros(7, 2, dtype=torch.float64)
+    group[:3, 0], group[3:6, 1] = 1.0, 1.0
+
+    def drawn(seed: int, late: int) -> Tensor:
+        shared = 1.5 * normal(seed + 100, 2, 8192 + 8)
+        x = normal(seed, 7, 8192) + group @ shared[:, 8:]
+        x[4] += shared[1, 8 - late : 8192 + 8 - late] - shared[1, 8:]
+        return x
+
+    info = replace(SCENE, sensors=tuple("1234567"))
+    found = sensor_delays(Comparison.of(info, drawn(60, 3), drawn(61, 0)[None]))
+    assert found is not None
+    assert found.delay.round().tolist() == [0, 0, 0, 0, 3, 0, 0]
+
+
+def test_values_of_few_steps_have_ends_as_well() -> None:
+    ends = end_stops(compared(on_grid(normal(62), 4.0), on_grid(normal(63), 4.0)))
+    assert min(end.p_value for end in ends) > 1e-3
 
 
 def test_a_level_that_goes_up_and_down_a_few_times_is_a_course() -> None:

@@ -122,8 +122,10 @@ def fitted_delays(phases: Phases) -> Delays:
     p, farthest, rounds = phases.weights.shape[-1], 16.0, 6
     grid = torch.arange(-farthest, farthest + 0.125, 0.25, dtype=torch.float64)
     delay = torch.zeros(p, dtype=torch.float64)
+    linked = _groups(phases)
+    others = (linked.sum(-1) > 1).nonzero()[:, 0].tolist()  # of a sensor that shares nothing no delay is known
     for _ in range(2):
-        for i in range(p):
+        for i in others:
             tried = delay.repeat(len(grid), 1)
             tried[:, i] = grid
             delay[i] = grid[int(phases.likelihood(tried).argmax())]
@@ -134,7 +136,7 @@ def fitted_delays(phases: Phases) -> Delays:
         if float(phases.likelihood(moved)) < float(phases.likelihood(delay)):
             break
         delay = moved
-    delay = delay - _usual(delay)
+    delay = delay - torch.stack([_usual(delay[group]) for group in linked])
     sd = torch.linalg.inv(_derivatives(phases, delay)[1]).diagonal().sqrt()
     none, best = float(phases.likelihood(torch.zeros_like(delay))), float(phases.likelihood(delay))
     return Delays(delay, sd, best - none)
@@ -173,6 +175,11 @@ def _off(phases: Phases) -> Tensor:
     return phases.weights * (1 - torch.eye(phases.weights.shape[-1], dtype=phases.weights.dtype))
 
 
+def _groups(phases: Phases) -> Tensor:
+    """Which sensors share what shows their delays, `(sensor, sensor)`."""
+    return phases.weights.abs().sum(0) > 0
+
+
 def _usual(delay: Tensor) -> Tensor:
     """The delay from which most sensors are least far: of two the first one's."""
     apart = (delay[:, None] - delay).abs().clamp(max=0.25).sum(-1)
@@ -187,4 +194,5 @@ def _derivatives(phases: Phases, delay: Tensor) -> tuple[Tensor, Tensor]:
     slope = 2 * (omega * turned.imag).sum(0).sum(-1)
     bend = 2 * (omega.square() * turned.abs()).sum(0)  # as where all is in phase
     information = torch.diag(bend.sum(-1)) - bend
-    return slope, information + information.diagonal().mean() / len(delay)  # what all have in common shows nowhere
+    # What all of a group have in common shows nowhere.
+    return slope, information + information.diagonal().mean() / len(delay) * _groups(phases)

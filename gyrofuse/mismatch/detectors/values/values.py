@@ -221,6 +221,8 @@ def _as_next_to_it(x: Tensor, limit: float, step: float, sd: float) -> float:
     """
     most, near = 8, 0.3  # steps; sd of the noise
     cells = min(most, int(near * sd / step)) if step > 0 else 0
+    if not cells:
+        return 0.0
     beside = int(((x < limit) & (x > limit - (cells + 0.5) * step)).sum())
     return float(special.pdtrc(int((x == limit).sum()) - 1, beside / cells)) if beside else 0.0
 
