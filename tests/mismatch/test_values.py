@@ -11,7 +11,7 @@ from scipy import signal
 import gyrofuse as gf
 from gyrofuse import AR1, WhiteNoise
 from gyrofuse.mismatch.detectors.spectra.band_tests import spectrum_test
-from gyrofuse.mismatch.detectors.values import quantisation_grid as lattices
+from gyrofuse.mismatch.detectors.values import lattices, quantisation_grid
 from gyrofuse.mismatch.detectors.values import values as marginals
 from gyrofuse.mismatch.detectors.values.median_windows import median_windows
 from gyrofuse.mismatch.detectors.values.missing_codes import missing_codes
@@ -95,7 +95,7 @@ def test_the_characteristic_function_is_that_of_the_definition() -> None:
     values = normal(500, g=g)
     u = torch.tensor([0.5, 3.0, 7.0], dtype=torch.float64)
     naive = [500 * abs(np.mean(np.exp(1j * v * values.numpy()))) ** 2 for v in u.tolist()]
-    np.testing.assert_allclose(lattices._power(values, u).numpy(), naive, rtol=1e-10)
+    np.testing.assert_allclose(quantisation_grid._power(values, u).numpy(), naive, rtol=1e-10)
 
 
 def test_values_cut_at_a_limit_are_clipped() -> None:

@@ -93,7 +93,7 @@ def course_of(white: Tensor, log_factor: Tensor) -> Course | None:
     size = log_factor.abs().max()
     if not float(size) > 0:
         return None
-    found = [_with_peak(white, slope) for slope in (log_factor / size, -log_factor / size)]
+    found = [_likeliest(white, slope) for slope in (log_factor / size, -log_factor / size)]
     return max(
         (course for course in found if course is not None),
         key=lambda course: float(course_scores(white, course.variance).sum()),
@@ -111,13 +111,13 @@ def waves_of(white: Tensor, log_factor: Tensor, weight: Tensor) -> tuple[Course,
     for half_waves in (4, 8, 16) if float(size) > 0 else ():
         if 2 * half_waves > m:
             break
-        course = _with_peak(white, log_factor / size, half_waves)
+        course = _likeliest(white, log_factor / size, half_waves)
         if course is not None:
             found.append((course, course_score(white, course, weight) + 2 * math.log(m) - half_waves * price))
     return max(found, key=lambda one: one[1], default=None)
 
 
-def _with_peak(white: Tensor, slope: Tensor, half_waves: int = 0) -> Course | None:
+def _likeliest(white: Tensor, slope: Tensor, half_waves: int = 0) -> Course | None:
     """The likeliest course to a peak at which each sensor is louder by so much, `(sensor,)`, up to a factor.
 
     Or the likeliest one of so many half waves.

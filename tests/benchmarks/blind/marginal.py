@@ -206,26 +206,26 @@ def _touched(
     )  # fmt: skip
 
 
-def lattice(bench: Bench, nats: float) -> Part:
-    """Bare rounding to a consumer sensor's LSB: every sample is altered, so the effect is certain and `nats` unused."""
-    step = float(bench.rng.choice([0.00875, 0.01526, 0.0305, 0.061]))
+def _in_steps(bench: Bench, name: str, step: float, convert: Callable[[Array, float], Array]) -> Part:
+    """What alters every sample of every sensor, so that it is certain."""
     everyone = tuple(range(bench.n_sensors))
     return _touched(
-        "quantization", CERTAIN, everyone, [CERTAIN] * len(everyone),
-        converter=lambda x: converter.round_to_lattice(x, step),
+        name, CERTAIN, everyone, [CERTAIN] * len(everyone),
+        converter=lambda x: convert(x, step),
         parameters={"lsb": quantity(step, "deg/s")},
     )  # fmt: skip
+
+
+def lattice(bench: Bench, nats: float) -> Part:
+    """Bare rounding to a consumer sensor's LSB; `nats` are unused."""
+    step = float(bench.rng.choice([0.00875, 0.01526, 0.0305, 0.061]))
+    return _in_steps(bench, "quantization", step, converter.round_to_lattice)
 
 
 def angle_counts(bench: Bench, nats: float) -> Part:
-    """An angle counted in whole steps, as of an optical gyro: every sample is altered, so `nats` are unused."""
+    """An angle counted in whole steps, as of an optical gyro; `nats` are unused."""
     step = float(bench.rng.uniform(0.7, 3.0) * bench.sigma.mean())
-    everyone = tuple(range(bench.n_sensors))
-    return _touched(
-        "quantization_noise", CERTAIN, everyone, [CERTAIN] * len(everyone),
-        converter=lambda x: converter.count_angle(x, step),
-        parameters={"lsb": quantity(step, "deg/s")},
-    )  # fmt: skip
+    return _in_steps(bench, "quantization_noise", step, converter.count_angle)
 
 
 def dead_band(bench: Bench, nats: float) -> Part:

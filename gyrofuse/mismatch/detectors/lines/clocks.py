@@ -70,6 +70,12 @@ class Slip:
         """p value of no slip."""
         return p_value_from_e_value(self.log_ratio)
 
+    def among(self, alike: float) -> Slip:
+        """What is known of it where so many sensors count as one."""
+        return replace(
+            self, gain=self.gain / alike, log_ratio=self.log_ratio / alike, skew_sd=self.skew_sd * math.sqrt(alike)
+        )
+
 
 class _Fit(NamedTuple):
     """The most likely slip of one kind, times in blocks.
@@ -124,10 +130,7 @@ def strongest_slip(comparison: Comparison) -> Slip | None:
     if found.p_value < CERTAIN and found.frequency * block >= 1 and _steady(comparison, found.frequency):
         tones.append(found.frequency)
     simulated = [
-        replace(slip, gain=slip.gain / alike, log_ratio=slip.log_ratio / alike, skew_sd=slip.skew_sd * math.sqrt(alike))
-        for f in shared[:3]
-        if (slip := _from_simulated(comparison, f)) is not None
-        for alike in (_alike(comparison, f),)
+        slip.among(_alike(comparison, f)) for f in shared[:3] if (slip := _from_simulated(comparison, f)) is not None
     ]
     if not tones and not simulated:
         return None
@@ -140,7 +143,7 @@ def strongest_slip(comparison: Comparison) -> Slip | None:
 def _from_simulated(comparison: Comparison, f: float) -> Slip | None:
     """All sensors together against a tone of the simulation, which they have in one phase but for a slope or steps."""
     observed = demodulated(comparison.white, f)
-    simulated = demodulated(whitened(comparison.reference.signal[0], comparison.base), f)
+    simulated = demodulated(_white_simulation(comparison), f)
     power, energy = _power_and_energy(observed)
     (slope, size), (other, their_size) = best_slope(observed), best_slope(simulated)
     length = comparison.n_samples // BLOCKS * BLOCKS
@@ -171,13 +174,19 @@ def _from_simulated(comparison: Comparison, f: float) -> Slip | None:
     )
 
 
+@derived
+def _white_simulation(comparison: Comparison) -> Tensor:
+    """The simulation's first record in units of the recording's noise, `(sensor, time)`."""
+    return whitened(comparison.reference.signal[0], comparison.base)
+
+
 def _in_both(comparison: Comparison, f: float) -> bool:
     """Whether a tone of the simulation is in the recording: what noise is left there in common has a phase as well."""
     least = 0.02  # of its power
-    signal = comparison.reference.signal[0]
-    theirs = _power_and_energy(demodulated(whitened(signal, comparison.base), f))[0].clamp(min=0).sum()
+    white = _white_simulation(comparison)
+    theirs = _power_and_energy(demodulated(white, f))[0].clamp(min=0).sum()
     own = _power_and_energy(demodulated(comparison.white, f))[0].clamp(min=0).sum()
-    return float(own / comparison.n_samples) > least * float(theirs / signal.shape[-1])
+    return float(own / comparison.n_samples) > least * float(theirs / white.shape[-1])
 
 
 def _alike(comparison: Comparison, f: float) -> float:

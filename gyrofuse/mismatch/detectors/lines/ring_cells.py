@@ -71,7 +71,7 @@ def in_another_order(white: Tensor) -> Tensor:
 
 def strongest_by_chance(scan: RingScan, disordered: RingScan) -> float:
     """Log likelihood ratio that a cell of a scan has by chance: beside all others, and beside samples in disorder."""
-    return max(math.log(scan.n_cells), *(cell.log_ratio for cell in disordered.cells[:1]), -math.inf)
+    return max([math.log(scan.n_cells), *(cell.log_ratio for cell in disordered.cells[:1])])
 
 
 def p_value_beside(own: RingScan, simulated: RingScan, disordered: RingScan) -> float:

@@ -8,6 +8,7 @@ recording's, `S` of `d` ordinates, is `-d tr((D C D*)^-1 S)` beside what no dela
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -120,15 +121,11 @@ def _linked(coherence: Tensor, ordinates: Tensor) -> Tensor:
 def fitted_delays(phases: Phases) -> Delays:
     """One sensor after the other over a grid, then all by Newton's steps; most of them are taken for right."""
     p, farthest, rounds = phases.weights.shape[-1], 16.0, 6
-    grid = torch.arange(-farthest, farthest + 0.125, 0.25, dtype=torch.float64)
     delay = torch.zeros(p, dtype=torch.float64)
     linked = _groups(phases)
     others = (linked.sum(-1) > 1).nonzero()[:, 0].tolist()  # of a sensor that shares nothing no delay is known
     for _ in range(2):
-        for i in others:
-            tried = delay.repeat(len(grid), 1)
-            tried[:, i] = grid
-            delay[i] = grid[int(phases.likelihood(tried).argmax())]
+        delay = delays_on_grid(phases, delay, others, farthest)
     for _ in range(rounds):
         slope, information = _derivatives(phases, delay)
         step = torch.linalg.solve(information, slope)
@@ -140,6 +137,16 @@ def fitted_delays(phases: Phases) -> Delays:
     sd = torch.linalg.inv(_derivatives(phases, delay)[1]).diagonal().sqrt()
     none, best = float(phases.likelihood(torch.zeros_like(delay))), float(phases.likelihood(delay))
     return Delays(delay, sd, best - none)
+
+
+def delays_on_grid(phases: Phases, start: Tensor, sensors: Sequence[int], farthest: float) -> Tensor:
+    """The likeliest delays `(sensor,)` of some sensors, one after the other, up to so many samples either way."""
+    grid, delay = torch.arange(-farthest, farthest + 0.125, 0.25, dtype=torch.float64), start.clone()
+    for i in sensors:
+        tried = delay.repeat(len(grid), 1)
+        tried[:, i] = grid
+        delay[i] = grid[int(phases.likelihood(tried).argmax())]
+    return delay
 
 
 def are_delays(phases: Phases, found: Delays) -> bool:

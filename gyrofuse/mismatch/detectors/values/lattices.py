@@ -82,9 +82,8 @@ def simulated_lattices(comparison: Comparison) -> tuple[Lattice | None, ...]:
     for i, own in enumerate(exact_lattices(comparison.as_came)):
         if own is not None and found[i] is None:
             values = side.signal[0, i]
-            offset = grid_offset(values, own.step)
-            if float((off_lattice(values, own.step, offset).abs() < 0.01).to(torch.float64).mean()) >= 0.999:
-                found[i] = own._replace(offset=offset)
+            if share_on_grid(values, own.step) >= 0.999:
+                found[i] = own._replace(offset=grid_offset(values, own.step))
     return tuple(found)
 
 
@@ -96,17 +95,17 @@ def code_lattices(side: Records) -> tuple[Lattice | None, ...]:
 
 def _exact_in(side: Records, finest: float) -> list[Lattice | None]:
     """Exact grids of steps from so many sd of a sample given its past."""
-    least = finest * innovation_sd(side)
-    return [_exact_lattice(*v, float(step)) for v, step in zip(distinct_values(side), least, strict=True)]
+    each = zip(distinct_values(side), innovation_sd(side), strict=True)
+    return [_exact_lattice(*values, float(sd), finest) for values, sd in each]
 
 
-def _exact_lattice(unique: Tensor, counts: Tensor, finest: float) -> Lattice | None:
+def _exact_lattice(unique: Tensor, counts: Tensor, sd: float, finest: float) -> Lattice | None:
     """Grid on which 999 of 1000 samples lie to a hundredth of a step: converters also have end stops.
 
     Its step is the usual or the smallest gap between values, but for finer ones: those are noise of arithmetic.
     """
     gaps = unique.diff()
-    wide = gaps[gaps >= finest]
+    wide = gaps[gaps >= finest * sd]
     for step in (float(wide.median()), float(wide.min())) if len(wide) > 1 else ():
         k = torch.cat([torch.zeros(1, dtype=torch.float64), (gaps / step).round().cumsum(0)])
         middle, mean = ((counts * v).sum() / counts.sum() for v in (k, unique))
@@ -115,7 +114,7 @@ def _exact_lattice(unique: Tensor, counts: Tensor, finest: float) -> Lattice | N
         if float(counts[off.abs() < 0.01].sum() / counts.sum()) >= 0.999:
             offset = math.remainder(float(mean - middle * step), step)
             found = Lattice(step, offset, 0.0, 0.0)
-            told = found.has_zero and step < 150 * finest  # coarser ones are met by a bias that stays there
+            told = found.has_zero and step < 3 * sd  # coarser ones are met by a bias that stays there
             return found._replace(cut_off=is_cut_off(step_counts(unique, counts, step))) if told else found
     return None
 
@@ -123,6 +122,12 @@ def _exact_lattice(unique: Tensor, counts: Tensor, finest: float) -> Lattice | N
 def grid_offset(values: Tensor, step: float) -> float:
     """Where a grid of a known step lies."""
     return float(torch.exp(2j * math.pi / step * values).mean().angle()) / (2 * math.pi) * step
+
+
+def share_on_grid(values: Tensor, step: float) -> float:
+    """Share of values that lie on a grid of a known step, wherever it lies, to a hundredth of the step."""
+    off = off_lattice(values, step, grid_offset(values, step))
+    return float((off.abs() < 0.01).to(torch.float64).mean())
 
 
 def off_lattice(values: Tensor, step: float | Tensor, offset: float | Tensor) -> Tensor:

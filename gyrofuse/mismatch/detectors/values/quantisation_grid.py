@@ -29,7 +29,7 @@ from gyrofuse.mismatch.detectors.values.lattices import (
     exact_lattices,
     grid_offset,
     innovation_sd,
-    off_lattice,
+    share_on_grid,
     simulated_lattices,
 )
 from gyrofuse.mismatch.signals.comparison import Comparison
@@ -243,8 +243,7 @@ def _too_coarse(comparison: Comparison, sensor: int, own: Lattice | None, other:
     if other.step < coarse * float(innovation_sd(comparison.reference)[sensor]):
         return False
     values = comparison.as_came.signal[0, sensor]
-    off = off_lattice(values, other.step, grid_offset(values, other.step))
-    if float((off.abs() < 0.01).to(torch.float64).mean()) > on:
+    if share_on_grid(values, other.step) > on:
         return False
     if own is not None:
         return own.step < other.step * (1 - 1e-3)

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.detectors.lines.line_signs import line_signs
-from gyrofuse.mismatch.detectors.spectra.delays import Phases, phases_of
+from gyrofuse.mismatch.detectors.spectra.delays import Phases, delays_on_grid, phases_of
 from gyrofuse.mismatch.likelihoods.spectra.data import block_spectra, reference_noise, shared_ordinates
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
@@ -187,11 +187,6 @@ def _signs(comparison: Comparison) -> tuple[Tensor, float]:
 def _is_late(phases: Phases, sign: Tensor) -> bool:
     """Whether a delay of the sensors that have the other sign fits the phases better, as of a filter of many taps."""
     farthest, better = 32.0, 10.0  # samples; nats
-    late = torch.zeros_like(sign)
-    grid = torch.arange(-farthest, farthest + 0.125, 0.25, dtype=torch.float64)
-    for i in (sign < 0).nonzero()[:, 0].tolist():
-        tried = late.repeat(len(grid), 1)
-        tried[:, i] = grid
-        late[i] = grid[int(phases.likelihood(tried).argmax())]
+    late = delays_on_grid(phases, torch.zeros_like(sign), (sign < 0).nonzero()[:, 0].tolist(), farthest)
     turned = torch.einsum("i,bij,j->", sign, phases.weights.real, sign)
     return float(phases.likelihood(late)) > float(turned) + better

@@ -150,6 +150,7 @@ def _reference(comparison: Comparison) -> Reference | None:
     return Reference(level, known)
 
 
+@derived
 def variance_p_value(comparison: Comparison) -> float:
     """p value that the noise level changes for a while: within the recording, and from the simulation's."""
     squares, gaussian = clipped_squares(comparison), math.isinf(own_spread(comparison).dof)
