@@ -87,7 +87,7 @@ def test_a_wide_case_is_complete_at_every_size_that_exists(kind):
         again = make_case(kind, nats, seed, **truth["asked"])
         np.testing.assert_array_equal(gyro, again.recording["gyro"])
         for effect in truth["effects"]:
-            assert effect["nats"] == pytest.approx(bench.CERTAIN if kind == "quantization_bare" else nats, rel=1e-6)
+            assert effect["nats"] == pytest.approx(bench.CERTAIN if kind in kinds.SIZELESS else nats, rel=1e-6)
             reached = {"one": 2 if effect["mechanism"] == "common_mode" else 1, "all": truth["n_sensors"]}
             if effect["oracle_law"] != "certain":  # which may turn out to touch fewer
                 assert len(effect["sensors"]) <= reached.get(truth["reach"], truth["n_sensors"])
@@ -257,7 +257,8 @@ def test_oracle_keeps_its_false_alarm_rate():
 # Those of single samples are certain; few designs of filters act as weakly; a trap's dwells change nothing; what only
 # the simulation has no recording shows.
 UNSIZED = (
-    *("quantization_bare", "dead_band", "clipping", "stuck_samples", "form:filter", "form:asymmetric_telegraph"),
+    *kinds.SIZELESS,
+    *("dead_band", "clipping", "stuck_samples", "form:filter", "form:asymmetric_telegraph"),
     *("high_pass", "form:high_pass", "form:band_stop"),
     *("form:simulated_resonance", "form:simulated_source", "form:simulated_spikes"),
 )

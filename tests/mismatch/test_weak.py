@@ -425,5 +425,7 @@ def test_strong_noise_that_goes_up_and_down_is_no_episode():
     noise = gf.WhiteNoise(1e-4)
     signal = noise.simulate(n, batch=(3,), generator=torch.Generator().manual_seed(1)) * level
     report = gf.diagnose(gf.Recording(signal, rate=100.0), noise)
-    assert "variance_change" not in [f.mechanism for f in report.findings]
-    assert "variance" in [entry.test for entry in report.unexplained]
+    assert [f.mechanism for f in report.findings] == ["variance_change"]
+    assert not {"start", "stop"} & set(report.findings[0].parameters)
+    assert "bit by bit" in str(report)
+    assert "variance" in [entry.test for entry in report.unexplained]  # two waves are more than one

@@ -11,6 +11,7 @@ from .bench import Bench, Part
 
 GROUPS = ("mechanism", "null", "pair", "two", "outside", "unidentifiable")  # and "real", which needs recordings
 WIDER = ("form", "common_noise", "fitted", "misfit")  # what users have beside them
+SIZELESS = ("quantization_bare", "angle_counts")  # kinds that every single sample proves, whatever size is asked
 
 
 @dataclass(frozen=True)

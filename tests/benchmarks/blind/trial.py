@@ -19,7 +19,7 @@ import numpy as np
 
 from .cases import NATS, RATE, Case, make_case
 from .judge import Verdict, judge
-from .kinds import GROUPS, KINDS
+from .kinds import GROUPS, KINDS, SIZELESS
 from .likelihood import OutOfReachError
 from .ordinary_view import is_concealed
 from .seal import freeze, seal, unseal
@@ -62,7 +62,7 @@ def plan_trial(
             continue
         if not kind.effects:
             items += [(name, None)] * nulls
-        elif kind.group == "unidentifiable" or name == "quantization_bare":
+        elif kind.group == "unidentifiable" or name in SIZELESS:
             items += [(name, None)] * (per_kind * len(nats))
         else:
             items += [(name, n) for n in nats] * per_kind
