@@ -67,6 +67,8 @@ def _shared_parts(comparison: Comparison) -> Tensor | None:
         for j in range(i):
             design = shares[:, i] * shares[:, j]  # (part, band)
             information = (design * weight) @ design.mT
+            if not bool(information.any()):  # what one of them has the other has not
+                continue
             information = information + _RIDGE * information.diagonal().amax() * torch.eye(len(design))
             covariance = torch.linalg.inv(information)
             r = covariance @ (design * weight) @ side.coherence[:, i, j].real

@@ -161,6 +161,19 @@ class Comparison:
         bare = without_lines(self.reference.signal, simulated_lines(self.reference))
         return whitened(self.reference.steadied(bare), self.base)
 
+    @cached_property
+    def steady_shares(self) -> Tensor:
+        """Share of each band's ordinates that its power is known from where the simulation's comes and goes, `(band,)`.
+
+        On either side: what only the recording has is no matter of chance.
+        """
+        shares = self.reference.steady_shares(self.bands)
+        return torch.nn.functional.pad(shares, (1, 1), value=1.0).unfold(0, 3, 1).amin(-1)  # a line goes farther
+
+    def steady_share(self, f: Tensor) -> Tensor:
+        """The same at frequencies, cycles per sample."""
+        return self.steady_shares[torch.bucketize(f, self.bands.ends[1]).clamp(max=len(self.steady_shares) - 1)]
+
     def generator(self) -> torch.Generator:
         """A source of the random numbers of a test, the same for every test of the comparison."""
         return torch.Generator().manual_seed(self.seed)

@@ -16,9 +16,10 @@ import math
 from dataclasses import dataclass
 
 import torch
+from scipy import stats
 from torch import Tensor
 
-from gyrofuse._base.transforms import fast_length
+from gyrofuse._base.transforms import fast_length, squared_modulus
 
 _TAPERS = 4  # an even number
 _PER_OCTAVE = 4
@@ -42,6 +43,12 @@ class Bands:
     edges: tuple[int, ...]
     frequency: Tensor
     dof: Tensor
+
+    @property
+    def ends(self) -> tuple[Tensor, Tensor]:
+        """Lower and upper ends, cycles per sample, `(band,)` each."""
+        edges = (torch.tensor(self.edges, dtype=torch.float64) - 0.5) / self.n_samples
+        return edges[:-1], edges[1:]
 
     def mean_of(self, density: Tensor) -> Tensor:
         """Means over the bands of values `(..., node)` at `nodes`."""
@@ -214,6 +221,45 @@ def median_powers(records: Tensor, wanted: Bands) -> tuple[Tensor, Tensor]:
         levels.append(own.median(-1).values / usual)
         chance.append(2.1 / independent)
     return torch.stack(levels, -1), torch.tensor(chance, dtype=torch.float64)
+
+
+def steady_shares(records: Tensor, wanted: Bands) -> Tensor:
+    """Share of the ordinates of bands that their mean powers are known from, `(band,)`.
+
+    A line that wanders through a band gives it power on some visits: these count, and not ordinates. Means of a band's
+    power over parts of a record vary then by more than those of Gaussian noise, by a factor `F`; where that is no
+    chance the share is one over it. Changes of the level of all bands together are left out.
+
+    Args:
+        records: `(record, sensor, time)`.
+        wanted: Bands.
+    """
+    parts, fewest, rare, low = 18, 64, 1e-3, 0.1  # of a record; bins; by chance; quantile of an estimate of `F`
+    n_records, p, n = records.shape
+    taper, shares = light_taper(n), torch.ones_like(wanted.dof)
+    transform = torch.fft.rfft((records - records.mean(-1, keepdim=True)) * taper)
+    whole = slice(1, -1)  # parts that the taper leaves as they are
+    bins = [(max(round(a * n), 1), round(b * n)) for a, b in zip(*(e.tolist() for e in wanted.ends), strict=True)]
+    wide = [k for k, (a, b) in enumerate(bins) if b - a >= fewest]
+    if not wide:
+        return shares
+    courses = []
+    for a, b in (bins[k] for k in wide):
+        envelope = torch.fft.ifft(transform[..., a:b], n=-(-(b - a) // parts) * parts)
+        power = squared_modulus(envelope).unflatten(-1, (parts, -1)).mean(-1)[..., whole]
+        courses.append(power / power.mean(-1, keepdim=True).clamp(min=1e-300))
+    course = torch.stack(courses, -1)  # (record, sensor, part, band)
+    if len(wide) > 4:
+        course = course / course.median(-1, keepdim=True).values
+    course = course / course.mean(-2, keepdim=True).clamp(min=1e-300)
+    ordinates = torch.tensor([bins[k][1] - bins[k][0] for k in wide], dtype=torch.float64)
+    dof = parts - 3  # of a record: a mean is subtracted
+    excess = course.var(-2).sum(0) * dof * ordinates / parts  # chi-square, (sensor, band)
+    dof *= n_records
+    certain = excess > float(stats.chi2.isf(rare / p, dof))
+    factor = torch.where(certain, excess / float(stats.chi2.ppf(low, dof)), 1.0)
+    shares[wide] = 1 / factor.amax(0)
+    return shares
 
 
 def hann_transform(signal: Tensor) -> tuple[Tensor, int]:

@@ -23,6 +23,7 @@ from gyrofuse.mismatch.signals.psd import (
     leaked,
     median_powers,
     narrow_bands,
+    steady_shares,
 )
 from gyrofuse.mismatch.signals.variance_course import VarianceCourse
 
@@ -197,6 +198,10 @@ class Records:
         chance = single.std() / single.numel() ** 0.5
         noise = (shared.sum() - shared.trace()) / (p * (p - 1)) + 2 * chance
         return max(float(block.mean()), float(single.mean() - noise), 0.0)
+
+    def steady_shares(self, wanted: Bands) -> Tensor:
+        """Share of the ordinates of bands that their mean powers are known from, `(band,)`."""
+        return torch.ones_like(wanted.dof) if self.gaussian else steady_shares(self.steady, wanted)
 
     @cached_property
     def power(self) -> Tensor:

@@ -28,6 +28,7 @@ from gyrofuse.mismatch.detectors.lines.demodulation import (
     slope_variance,
     turn_by,
 )
+from gyrofuse.mismatch.detectors.lines.line_sizes import line_sizes
 from gyrofuse.mismatch.detectors.lines.lost_samples import Loss, losses_of, paths_of, put_back
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.signals.comparison import Comparison
@@ -130,7 +131,9 @@ def strongest_slip(comparison: Comparison) -> Slip | None:
     if found.p_value < CERTAIN and found.frequency * block >= 1 and _steady(comparison, found.frequency):
         tones.append(found.frequency)
     simulated = [
-        slip.among(_alike(comparison, f)) for f in shared[:3] if (slip := _from_simulated(comparison, f)) is not None
+        slip.among(_alike(comparison, f))
+        for f in shared[:3]
+        if not _wanders(comparison, f) and (slip := _from_simulated(comparison, f)) is not None
     ]
     if not tones and not simulated:
         return None
@@ -187,6 +190,15 @@ def _in_both(comparison: Comparison, f: float) -> bool:
     theirs = _power_and_energy(demodulated(white, f))[0].clamp(min=0).sum()
     own = _power_and_energy(demodulated(comparison.white, f))[0].clamp(min=0).sum()
     return float(own / comparison.n_samples) > least * float(theirs / white.shape[-1])
+
+
+def _wanders(comparison: Comparison, f: float) -> bool:
+    """Whether a line of the simulation has another phase at other times, so that its slope is chance."""
+    sizes, most, lines = line_sizes(comparison), 0.1, comparison.reference.lines  # of an amplitude
+    if sizes is None or f not in lines:
+        return False
+    size, sd = sizes.reference[:, lines.index(f)], sizes.wander[:, lines.index(f)].sqrt()
+    return bool((sd > most * size)[size.argmax()])
 
 
 def _alike(comparison: Comparison, f: float) -> float:

@@ -6,6 +6,7 @@ import math
 from typing import NamedTuple
 
 import torch
+from scipy import stats
 from torch import Tensor
 
 from gyrofuse.mismatch.signals.comparison import Comparison
@@ -23,6 +24,7 @@ class LineSizes(NamedTuple):
         sd: Standard deviation of what was recorded, for the noise around.
         simulated_sd: Of what was simulated, as well as its records agree.
         present: Standard deviations by which amplitudes in the simulation are larger than those of noise, on average.
+        wander: Variance of an amplitude in the simulation by how its line wanders.
     """
 
     observed: Tensor
@@ -30,6 +32,7 @@ class LineSizes(NamedTuple):
     sd: Tensor
     simulated_sd: Tensor
     present: Tensor
+    wander: Tensor
 
     @property
     def z(self) -> Tensor:
@@ -70,6 +73,9 @@ def line_sizes(comparison: Comparison) -> LineSizes | None:
     ours, theirs = (2 * density / side.signal.shape[-1] for side in (comparison.observed, comparison.reference))
     if len(others) > 1:
         theirs = theirs.maximum(others.var(0))
+    wander = _wander(comparison)
+    ours = ours + wander * (comparison.reference.signal.shape[-1] / comparison.n_samples)
+    theirs = theirs.maximum(wander)
     fitted = comparison.reference.uncertainty
     effective_samples = comparison.reference.effective_samples if fitted is None else fitted.n_samples
     known = (theirs / len(others)).maximum(2 * density / effective_samples)
@@ -77,4 +83,25 @@ def line_sizes(comparison: Comparison) -> LineSizes | None:
     noise = (2 * density / comparison.reference.signal.shape[-1]).sqrt()
     mean, sd = math.sqrt(math.pi / 2), math.sqrt(2 - math.pi / 2)
     present = (others.mean(0) / noise - mean) * math.sqrt(len(others)) / sd
-    return LineSizes(own[0], others.mean(0), ours.sqrt(), known.sqrt(), present)
+    return LineSizes(own[0], others.mean(0), ours.sqrt(), known.sqrt(), present, wander)
+
+
+def _wander(comparison: Comparison) -> Tensor:
+    """Variance of the amplitude of a record's lines in the simulation by how they wander, `(sensor, line)`.
+
+    What the scatter over parts of a record is beyond that of noise; 0 where it is not.
+    """
+    side, parts, rare = comparison.reference, 16, 1e-3
+    frequency, length = torch.tensor(side.lines, dtype=torch.float64), side.signal.shape[-1] // parts
+    taper = torch.hann_window(length, periodic=False, dtype=torch.float64)
+    turn = torch.polar(
+        torch.ones(len(frequency), parts * length, dtype=torch.float64),
+        -2 * math.pi * frequency[:, None] * torch.arange(parts * length, dtype=torch.float64),
+    ).unflatten(-1, (parts, length))
+    segments = side.signal[..., : parts * length].unflatten(-1, (parts, length))
+    segments = (segments - segments.mean(-1, keepdim=True)) * taper
+    z = torch.einsum("rskt,lkt->rslk", segments.to(turn.dtype), turn) * (2 / taper.sum())
+    scatter = (z - z.mean(-1, keepdim=True)).abs().square().mean((0, -1)) * (parts / (parts - 1))
+    noise = 4 * taper.square().sum() / taper.sum().square() * comparison.base.spectrum(frequency)
+    dof = 2 * len(side.signal) * (parts - 1)
+    return torch.where(scatter > noise * float(stats.chi2.isf(rare, dof)) / dof, scatter - noise, 0.0) / parts

@@ -17,7 +17,7 @@ A line that wanders or comes and goes is as strong in the record run backwards; 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import torch
@@ -63,7 +63,7 @@ def ring_down_test(comparison: Comparison) -> TestResult:
 @derived
 def ring_downs(comparison: Comparison) -> RingScan:
     """Ring-downs of the recording."""
-    return scanned_ring_downs(comparison.lineless)
+    return scanned_ring_downs(comparison.lineless, comparison.steady_share)
 
 
 def ring_down_p_value(comparison: Comparison) -> float:
@@ -77,22 +77,28 @@ def ring_down_p_value(comparison: Comparison) -> float:
 @derived
 def disordered(comparison: Comparison) -> RingScan:
     """The same of the recording's samples in another order, of which none lasts."""
-    return scanned_ring_downs(in_another_order(comparison.lineless))
+    return scanned_ring_downs(in_another_order(comparison.lineless), comparison.steady_share)
 
 
 @derived
 def _simulated(comparison: Comparison) -> RingScan:
-    return scanned_ring_downs(comparison.lineless_reference[0])
+    return scanned_ring_downs(comparison.lineless_reference[0], comparison.steady_share)
 
 
-def scanned_ring_downs(white: Tensor) -> RingScan:
-    """All ring-downs of whitened samples `(sensor, time)`, without what is as strong in them run backwards."""
+def scanned_ring_downs(white: Tensor, steady: Callable[[Tensor], Tensor] = torch.ones_like) -> RingScan:
+    """All ring-downs of whitened samples `(sensor, time)`, without what is as strong in them run backwards.
+
+    Args:
+        white: The samples.
+        steady: Share of the ordinates at frequencies, cycles per sample, that powers are known from: where it is below
+            a half the simulation's own lines wander, which is no ring.
+    """
     clip, n = 4.5, white.shape[-1]  # standard deviations: no spike rings
     level = (white / local_level(white).sqrt()).clamp(-clip, clip)
-    found = _scanned(level)
+    found = _scanned(level, steady)
     if found.p_value > CHANCE:
         return found
-    kept = irreversible(found, _scanned(level.flip(-1)), n)
+    kept = irreversible(found, _scanned(level.flip(-1), steady), n)
     if kept.p_value <= CHANCE:
         return kept
     # A loud one is a level of its own, over which it does not die away.
@@ -119,14 +125,15 @@ def _dies_away(white: Tensor, cell: RingCell) -> bool:
     return 2 * math.sqrt(float(power[peak])) > least and float(before) < share * float(after)
 
 
-def _scanned(white: Tensor) -> RingScan:
+def _scanned(white: Tensor, steady: Callable[[Tensor], Tensor]) -> RingScan:
     white = white.to(torch.float32)  # enough to find a place; numbers are fitted to the samples as they are
     n, total, n_cells, found = white.shape[-1], -math.inf, 0, list[RingCell]()
     tau, windows = 8, 96  # a shorter one is a spike; medians over time take a hundred windows
     while tau * windows <= n:
         for part in _powers(white, tau):
             n_cells += part.power[0].numel()
-            frame, place = (part.power.amax(0) > NATS_AS_GOOD).nonzero(as_tuple=True)
+            f = (part.lowest + torch.arange(part.power.shape[-1], dtype=torch.float64)) / part.length
+            frame, place = ((part.power.amax(0) > NATS_AS_GOOD) & (steady(f) > 0.5)).nonzero(as_tuple=True)
             if not len(frame):
                 continue
             own = part.power[:, frame, place].to(torch.float64)

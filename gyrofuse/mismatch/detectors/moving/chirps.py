@@ -26,7 +26,7 @@ from gyrofuse.mismatch.stats.level_scan import local_level
 
 def chirp_test(comparison: Comparison) -> TestResult:
     """A line whose frequency moves, that the simulation does not have."""
-    found, p_value = _strongest(comparison.observed), _p_value(comparison)
+    found, p_value = _strongest(comparison), _p_value(comparison)
     first, last = (f * comparison.info.rate for f in (found.first, found.last))
     where = comparison.info.named(found.sensors, "all sensors")
     by_way = "".join(f", by way of {turn * comparison.info.rate:g} Hz" for turn in found.turns)
@@ -49,27 +49,41 @@ def swept(comparison: Comparison, nats: float, level: float) -> bool:
         nats: Gain of another explanation of the spectrum.
         level: Largest p value of the chirp.
     """
-    return _p_value(comparison) <= level and _strongest(comparison.observed).nats > nats
+    return _p_value(comparison) <= level and _strongest(comparison).nats > nats
 
 
 def strongest_chirp(comparison: Comparison) -> tuple[float, Sweep]:
     """The best straight track, and its p value beyond what the simulation shows."""
-    return _p_value(comparison), _strongest(comparison.observed)
+    return _p_value(comparison), _strongest(comparison)
 
 
 def _p_value(comparison: Comparison) -> float:
-    p_value = _strongest(comparison.observed).p_value
+    p_value = _strongest(comparison).p_value
     # Lines that both sides have leave traces of any size: beside what the simulation shows nothing can be said.
-    seen_in_both = p_value < CHANCE and _strongest(comparison.reference).p_value < CHANCE
+    seen_in_both = p_value < CHANCE and _simulated(comparison).p_value < CHANCE
     return 1.0 if seen_in_both else p_value
 
 
 @derived
-def _strongest(side: Records) -> Sweep:
-    """The best track in the first record."""
-    return strongest_sweep(decorrelated_record(side))
+def _strongest(comparison: Comparison) -> Sweep:
+    """The best track in the recording."""
+    return strongest_sweep(_weighed(decorrelated_record(comparison.observed), comparison))
 
 
+@derived
+def _simulated(comparison: Comparison) -> Sweep:
+    """The best track in the simulation's first record."""
+    return strongest_sweep(_weighed(decorrelated_record(comparison.reference), comparison))
+
+
+def _weighed(white: Tensor, comparison: Comparison) -> Tensor:
+    """Whitened samples `(sensor, time)` with less of bands in which the simulation's own lines wander."""
+    n = white.shape[-1]
+    share = comparison.steady_share(torch.arange(n // 2 + 1, dtype=torch.float64) / n)
+    return white if bool((share == 1).all()) else torch.fft.irfft(torch.fft.rfft(white) * share.sqrt(), n=n)
+
+
+@derived
 def decorrelated_record(side: Records) -> Tensor:
     """Whitened record `(sensor, time)` of a steady level, without the coherence of broad bands."""
     # Standard deviations, and samples beyond: pulses and spikes have all frequencies, also those of a line that moves.

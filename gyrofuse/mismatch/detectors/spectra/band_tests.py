@@ -112,7 +112,9 @@ def coherence_test(comparison: Comparison) -> TestResult:
     Of 80 ordinates and more the sum is Gamma distributed but for a slightly heavier tail, here that of F.
     """
     fewest = 80
-    d, reference = comparison.observed.coherence_dof, comparison.reference.coherence_dof
+    d, reference = (
+        side.coherence_dof * comparison.steady_shares for side in (comparison.observed, comparison.reference)
+    )
     if comparison.n_sensors < 2:
         return TestResult("coherence", 1.0, "a single sensor has no pairs")
     known = (d >= fewest) & (reference >= fewest)
@@ -158,7 +160,10 @@ def power_tails(comparison: Comparison) -> Tensor:
     logarithm is then normal, while that of few ordinates is skew.
     """
     ratio = comparison.observed.power / comparison.reference.power
-    d, s = comparison.bands.dof * comparison.observed.evenness, comparison.reference.power_dof
+    d, s = (
+        dof * comparison.steady_shares
+        for dof in (comparison.bands.dof * comparison.observed.evenness, comparison.reference.power_dof)
+    )
     own = level_variance(comparison) - comparison.reference.level_variance  # that of the simulation is in its own
     d = d / (1 + d * own[:, None])
     law = stats.f(2 * d.numpy(), 2 * s.clamp(min=1e-9).numpy())

@@ -25,7 +25,7 @@ from gyrofuse.mismatch.detectors.spectra.shared_peak_scan import (
 from gyrofuse.mismatch.likelihoods.spectra.coherence import decorrelated
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
-from gyrofuse.mismatch.signals.psd import light_taper
+from gyrofuse.mismatch.signals.psd import Bands, light_taper, steady_shares
 from gyrofuse.mismatch.stats.multiplicity import e_value_of_some, p_value_from_e_value, sidak
 
 # Bins of a spectrum under the light taper, a tenth of which is at either end, for an independent one in far tails.
@@ -104,6 +104,9 @@ def strongest_peak(comparison: Comparison) -> Stretch:
             scan.log_ratio[over] = -math.inf
         if not line:
             compared.add(stretch.frequency)
+            white = comparison.lineless[None], comparison.lineless_reference
+            shares = [_shares_around(side, stretch, others.source) for side in white]
+            own, others = (side.known_from(*map(min, *shares)) for side in (own, others))
             best.log_ratio[best.first == a] = min(as_scanned, own.over(others).log_ratio())
     return nothing
 
@@ -167,6 +170,22 @@ def _flanks(power: Tensor, a: int, n: int) -> Tensor:
     return torch.cat([left, right], -1)
 
 
+def _shares_around(white: Tensor, stretch: Stretch, source: Tensor) -> tuple[float, float]:
+    """Share of a stretch's ordinates that its power is known from, and of those of its flanks.
+
+    Args:
+        white: Whitened samples `(record, sensor, time)`.
+        stretch: The stretch.
+        source: Sum of sensors `(sensor,)` that shows it best: a line that all of them have stands out in that.
+    """
+    n, width = white.shape[-1], stretch.width
+    ends = stretch.frequency + width * torch.tensor([-2.0, -0.5, 0.5, 2.0], dtype=torch.float64)
+    edges = tuple((n * ends.clamp(1 / n, 0.5)).round().int().tolist())
+    around = Bands(n, edges, ends[:-1], torch.ones(3, dtype=torch.float64))
+    below, own, above = steady_shares(torch.cat([white, (source @ white)[:, None]], 1), around).tolist()
+    return own, min(below, above)
+
+
 def _alone(power: Tensor, a: int, n: int, d: float) -> tuple[int, ...]:
     """Sensors in which `n` bins from `a` on, of `d` independent ordinates, stand out alone."""
     tails = stats.f.sf((power[:, a : a + n].mean(-1) / _flanks(power, a, n).mean(-1)).numpy(), 2 * d, 6 * d)
@@ -196,6 +215,19 @@ class _BesideFlanks(NamedTuple):
         parts = [part.movedim(0, 1).flatten(1) for part in stretches]  # (sensor, ordinate)
         inside, beside = (part @ part.mH / part.shape[-1] for part in parts)
         return cls(inside, beside, *(part.shape[-1] * side.ordinates for part in parts))
+
+    @property
+    def source(self) -> Tensor:
+        """Sum of sensors `(sensor,)` in which the stretch stands out most over its flanks."""
+        root = _root(self.beside)
+        left = torch.linalg.solve_triangular(root, self.inside, upper=False)
+        contrast = torch.linalg.solve_triangular(root, left.mH, upper=False)
+        top = torch.linalg.eigh(contrast)[1][:, -1:]
+        return torch.linalg.solve_triangular(root.mH, top, upper=True)[:, 0].real
+
+    def known_from(self, own: float, flanks: float) -> _BesideFlanks:
+        """Where that is a share of the stretch's ordinates, and of those of its flanks."""
+        return self._replace(m=own * self.m, f=flanks * self.f)
 
     def log_ratio(self) -> float:
         """Logarithm of the mean likelihood ratio of a bump of all sensors or of some."""

@@ -11,8 +11,11 @@ from torch import Tensor
 
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of, whitened_difference
+from gyrofuse.mismatch.likelihoods.spectra.coherence import coherence_of
+from gyrofuse.mismatch.likelihoods.spectra.data import block_spectra
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
+from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED
 from gyrofuse.mismatch.stats.multiplicity import sidak
 
 
@@ -63,7 +66,8 @@ def common_source(comparison: Comparison) -> Source | None:
     # one as long as the recording; below the second that may be taken for granted where it shares nothing else.
     absent, surely, shares_p_value = 1.5, 0.7, 0.1
     neighbours = 1.1  # variance of sums over bands, of which those next to each other are slightly correlated
-    p, d, s = comparison.n_sensors, comparison.observed.coherence_dof, comparison.reference.coherence_dof
+    p, steady = comparison.n_sensors, comparison.steady_shares
+    d, s = comparison.observed.coherence_dof * steady, comparison.reference.coherence_dof * steady
     known = (d >= 2 * p) & (s >= 2 * p)
     if p < 2 or int(known.sum()) < 2:
         return None
@@ -104,6 +108,28 @@ def common_source(comparison: Comparison) -> Source | None:
         nothing &= sidak(_tail(shown, p, real), 2 * len(largest)) > shares_p_value
     best = min(found, key=lambda source: source.p_value)
     return best._replace(independent=best.independent and nothing)
+
+
+@derived
+def shared_ordinates(comparison: Comparison) -> tuple[Tensor, Tensor]:
+    """Complex ordinates that a sensor shares with the others, in the simulation and in the recording, `(sensor,)`.
+
+    By squared coherences, less what chance gives them, as if both sides told equally much.
+    """
+    both, apart = block_spectra(comparison), 1 - torch.eye(comparison.n_sensors, dtype=torch.float64)
+    sides = (
+        both.reference.mean(torch.ones(N_FOLDS, dtype=torch.bool)),
+        both.observed.mean(torch.ones(N_JUDGED, dtype=torch.bool)),
+    )
+    told = 1 / torch.stack([1 / d.clamp(min=1e-9) for _, d in sides]).sum(0)
+    simulated, recorded = (
+        (
+            (told[:, None, None] * apart)
+            * (coherence_of(matrices).abs().square() - 1 / d.clamp(min=1.0)[:, None, None])
+        ).sum((0, -1))
+        for matrices, d in sides
+    )
+    return simulated, recorded
 
 
 def _tail(size: float, p: int, real: bool) -> float:

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from gyrofuse.mismatch.detectors.lines.line_signs import line_signs
 from gyrofuse.mismatch.detectors.spectra.delays import Phases, delays_on_grid, phases_of
-from gyrofuse.mismatch.likelihoods.spectra.data import block_spectra, reference_noise, shared_ordinates
+from gyrofuse.mismatch.detectors.spectra.pooled_coherence import shared_ordinates
+from gyrofuse.mismatch.likelihoods.spectra.data import block_spectra, reference_noise
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED

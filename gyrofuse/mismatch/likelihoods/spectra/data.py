@@ -21,7 +21,7 @@ from torch import Tensor
 
 from gyrofuse._base.transforms import cosine_ordinates
 from gyrofuse.mismatch.decisions import CERTAIN
-from gyrofuse.mismatch.likelihoods.spectra.coherence import coherence_of, smooth_coherence
+from gyrofuse.mismatch.likelihoods.spectra.coherence import smooth_coherence
 from gyrofuse.mismatch.likelihoods.spectra.noise_parts import Ground
 from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios, exact
 from gyrofuse.mismatch.signals.comparison import Comparison
@@ -86,6 +86,12 @@ class BlockBands(Bands):
     def nodes(self) -> Tensor:
         return torch.cat([self.below.flatten(), super().nodes, self.beyond.flatten()])
 
+    @property
+    def ends(self) -> tuple[Tensor, Tensor]:
+        nodes = self.nodes.unflatten(-1, (-1, N_NODES))
+        beside = (nodes[:, 1] - nodes[:, 0]) / 2
+        return nodes[:, 0] - beside, nodes[:, -1] + beside
+
     def mean_of(self, density: Tensor) -> Tensor:
         return density @ self.response
 
@@ -122,11 +128,13 @@ class Compared(NamedTuple):
         bands: Bands of both.
         observed: Spectra of the recording by block, 32 parts.
         reference: Spectra of the reference by the fold that holds them out, 4 parts.
+        steady: Share of the ordinates that powers are known from where the reference's come and go, `(band,)`.
     """
 
     bands: BlockBands
     observed: Spectra
     reference: Spectra
+    steady: Tensor
 
 
 @derived
@@ -134,7 +142,8 @@ def block_spectra(comparison: Comparison) -> Compared:
     """Cross-spectra of both sides of a comparison."""
     observed, reference = (_spectra(side, comparison.n_samples) for side in (comparison.observed, comparison.reference))
     folds = Spectra(*(part.unflatten(0, (-1, N_FOLDS)).sum(0) for part in reference))
-    return Compared(compared_bands(comparison.n_samples), observed, folds)
+    bands = compared_bands(comparison.n_samples)
+    return Compared(bands, observed, folds, comparison.reference.steady_shares(bands))
 
 
 @derived
@@ -163,28 +172,6 @@ def _ground(comparison: Comparison) -> Ground:
     f, slow = bands.nodes, bands.nodes < float(narrow_bands(comparison.n_samples).frequency[0])
     shown = torch.where(slow, reference_noise(comparison).spectrum(f), comparison.reference.density(f))
     return Ground(analog_noise(comparison), bands, shown, comparison.rounding)
-
-
-@derived
-def shared_ordinates(comparison: Comparison) -> tuple[Tensor, Tensor]:
-    """Complex ordinates that a sensor shares with the others, in the simulation and in the recording, `(sensor,)`.
-
-    By squared coherences, less what chance gives them, as if both sides told equally much.
-    """
-    both, apart = block_spectra(comparison), 1 - torch.eye(comparison.n_sensors, dtype=torch.float64)
-    sides = (
-        both.reference.mean(torch.ones(N_FOLDS, dtype=torch.bool)),
-        both.observed.mean(torch.ones(N_JUDGED, dtype=torch.bool)),
-    )
-    told = 1 / torch.stack([1 / d.clamp(min=1e-9) for _, d in sides]).sum(0)
-    simulated, recorded = (
-        (
-            (told[:, None, None] * apart)
-            * (coherence_of(matrices).abs().square() - 1 / d.clamp(min=1.0)[:, None, None])
-        ).sum((0, -1))
-        for matrices, d in sides
-    )
-    return simulated, recorded
 
 
 def ratios(
@@ -218,6 +205,7 @@ def ratios(
     for factor in () if formed else comparison.bent:
         changed = both.bands.mean_of(factor(both.bands.nodes))  # (sensor, band)
         usable[(changed.clamp(min=1e-300).log().abs() > _CHANGED).mT] = 0.0
+    d, s = d * both.steady, s * both.steady
     ground = _ground(comparison)
     power = reference.diagonal(dim1=-2, dim2=-1).real
     size = torch.where(power > 0, power, ground.whole.mT).rsqrt()

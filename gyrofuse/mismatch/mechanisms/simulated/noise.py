@@ -15,7 +15,8 @@ from gyrofuse.mismatch.detectors.exchanged import exchanged
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.detectors.spectra.peak_fit import Oscillation, bump_at
 from gyrofuse.mismatch.detectors.spectra.peaks import Stretch, strongest_peak
-from gyrofuse.mismatch.likelihoods.spectra.data import reference_noise, shared_ordinates
+from gyrofuse.mismatch.detectors.spectra.pooled_coherence import shared_ordinates
+from gyrofuse.mismatch.likelihoods.spectra.data import reference_noise
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
 from gyrofuse.mismatch.mechanisms.spectra.bumps.oscillation import Mode, OscillationOnTop, refitted_mode
 from gyrofuse.mismatch.mechanisms.spectra.bumps.resonance import Resonance
@@ -192,7 +193,8 @@ class MovedResonance(SimulatedResonance):
             for bump in (old, new)
         )
         recorded, simulated = (Resonance(_mode(bump)) for bump in (new, old))
-        own = _base_below(comparison.reference, simulated.mode)
+        if (own := _base_below(comparison.reference, simulated.mode)) is None:
+            return None
         # Flanks of a mode are not quite those of an AR2.
         return cls(simulated, own, recorded, approximate=True).found(
             f"the simulation's resonance at {before} is at {after} in the recording, in all sensors",
@@ -329,11 +331,13 @@ def _hump_of(side: Records) -> Stretch | None:
     return best[1]
 
 
-def _base_below(side: Records, mode: Mode) -> NoiseSpectrum:
-    """The simple spectrum of the noise that a mode stands on."""
-    mostly = 0.5  # of a power
+def _base_below(side: Records, mode: Mode) -> NoiseSpectrum | None:
+    """The simple spectrum of the noise that a mode stands on; None where hardly a band shows that."""
+    mostly, fewest = 0.5, 8  # of a power; bands
     alone = side.bands.mean_of(mode.profile(side.bands.nodes)) * mode.gain.abs().square()[:, None]
     beside = (alone < mostly * side.power).all(0)
+    if int((beside & (side.dof > 0)).sum()) < fewest:
+        return None
     return fit_base(torch.where(beside, side.power - alone, 0.0), side.bands, side.bands.n_samples, side.dof * beside)
 
 
