@@ -16,6 +16,7 @@ from gyrofuse.fitting.gmwm_result import GMWMResult
 from gyrofuse.fitting.joint import JointFit
 from gyrofuse.fitting.ranking.result import RankResult
 from gyrofuse.io.recording import Recording
+from gyrofuse.mismatch.detectors.lines.line_sizes import line_sizes
 from gyrofuse.mismatch.detectors.variance.level_spread import with_spread
 from gyrofuse.mismatch.repair.repaired_model import RepairedModel
 from gyrofuse.mismatch.repair.session_model import SessionModel, records_for
@@ -201,7 +202,7 @@ def same_data_words(given: Comparison, judge: Recording | Tensor | None) -> str:
 def _lines(simulation: Recording | Tensor | Model | ArrayModel, comparison: Comparison) -> tuple[float, ...]:
     """Frequencies of the simulation's tones, cycles per sample: those that its model names, and those to be seen.
 
-    Strongest first.
+    Strongest first; of those that are seen none that wanders: it is noise, of which the recording has other peaks.
     """
     named = simulation.lines if isinstance(simulation, Model) else ()
     lines: list[float] = []
@@ -218,6 +219,8 @@ def _lines(simulation: Recording | Tensor | Model | ArrayModel, comparison: Comp
     for _ in range(_SEARCHES):  # the side lobes of strong lines hide weak ones
         if not added(simulated_lines(comparison.knowing(tuple(lines)).reference)):
             break
+    if not named and (sizes := line_sizes(comparison.knowing(tuple(lines)))) is not None:
+        lines = [f for f, wanders in zip(lines, sizes.wanders.tolist(), strict=True) if not wanders]
     strength = amplitudes(comparison.reference.signal, tuple(lines)).mean((0, 1)) if lines else torch.zeros(0)
     return tuple(lines[i] for i in strength.argsort(descending=True).tolist())
 

@@ -137,7 +137,7 @@ class Comparison:
     @cached_property
     def line(self) -> FoundLine:
         """The strongest line of the recording that the simulation does not have."""
-        return strongest_line(self.observed, self.reference)
+        return strongest_line(self.observed, self.reference, self.steady_share)
 
     @cached_property
     def white(self) -> Tensor:
@@ -167,8 +167,7 @@ class Comparison:
 
         On either side: what only the recording has is no matter of chance.
         """
-        shares = self.reference.steady_shares(self.bands)
-        return torch.nn.functional.pad(shares, (1, 1), value=1.0).unfold(0, 3, 1).amin(-1)  # a line goes farther
+        return self.reference.steady_shares(self.bands)
 
     def steady_share(self, f: Tensor) -> Tensor:
         """The same at frequencies, cycles per sample."""

@@ -17,7 +17,8 @@ counts in neither; in a plain sum it would look like a line.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import torch
 from scipy import fft, special
@@ -69,8 +70,16 @@ class Lines:
     n_bins: int
 
 
-def strongest_line(observed: Records, reference: Records) -> FoundLine:
-    """The least probable line of a recording that the simulation does not have."""
+def strongest_line(
+    observed: Records, reference: Records, steady: Callable[[Tensor], Tensor] = torch.ones_like
+) -> FoundLine:
+    """The least probable line of a recording that the simulation does not have.
+
+    Args:
+        observed, reference: Both sides.
+        steady: Share of the ordinates at frequencies, cycles per sample, that powers are known from: where lines of the
+            simulation wander they stand still for a while by chance.
+    """
     z, length = _transformed(observed.signal[0], reference.base)
     f = torch.arange(z.shape[-1], dtype=torch.float64) / length
     shortest = min(observed.signal.shape[-1], reference.signal.shape[-1])
@@ -79,6 +88,7 @@ def strongest_line(observed: Records, reference: Records) -> FoundLine:
         here = (f - line).abs() < (GUARD + 1) / shortest
         known |= here | ((f - line).abs() < _reach(z[:, here]) / observed.signal.shape[-1])
     lines = _lines(z, length, observed, reference.base, known)
+    lines = replace(lines, log_p=lines.log_p * steady(lines.frequency))
     # Of lines that are all beyond doubt the strongest is the first: by how much they are depends on the bins nearby.
     beyond_doubt = -100.0  # logarithm of a p value
     order = lines.log_p.clamp(min=beyond_doubt).argsort(stable=True).tolist()

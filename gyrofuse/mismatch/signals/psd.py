@@ -257,7 +257,10 @@ def steady_shares(records: Tensor, wanted: Bands) -> Tensor:
     excess = course.var(-2).sum(0) * dof * ordinates / parts  # chi-square, (sensor, band)
     dof *= n_records
     certain = excess > float(stats.chi2.isf(rare / p, dof))
-    factor = torch.where(certain, excess / float(stats.chi2.ppf(low, dof)), 1.0)
+    apart = course - course.mean(-2, keepdim=True)
+    follows = sum((apart[..., k:, :] * apart[..., :-k, :]).sum((0, -2)) for k in (1, 2))
+    longer = (1 + 2 * torch.as_tensor(follows) / apart.square().sum((0, -2)).clamp(min=1e-300)).clamp(min=1)
+    factor = torch.where(certain, longer * excess / float(stats.chi2.ppf(low, dof)), 1.0)
     shares[wide] = 1 / factor.amax(0)
     return shares
 

@@ -200,8 +200,14 @@ class Records:
         return max(float(block.mean()), float(single.mean() - noise), 0.0)
 
     def steady_shares(self, wanted: Bands) -> Tensor:
-        """Share of the ordinates of bands that their mean powers are known from, `(band,)`."""
-        return torch.ones_like(wanted.dof) if self.gaussian else steady_shares(self.steady, wanted)
+        """Share of the ordinates of bands that their mean powers are known from, `(band,)`.
+
+        Next to a band through which a line wanders it may go in another record.
+        """
+        if self.gaussian:
+            return torch.ones_like(wanted.dof)
+        own = steady_shares(self.steady, wanted)
+        return torch.nn.functional.pad(own, (1, 1), value=1.0).unfold(0, 3, 1).amin(-1)
 
     @cached_property
     def power(self) -> Tensor:

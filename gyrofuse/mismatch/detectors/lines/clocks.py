@@ -194,11 +194,8 @@ def _in_both(comparison: Comparison, f: float) -> bool:
 
 def _wanders(comparison: Comparison, f: float) -> bool:
     """Whether a line of the simulation has another phase at other times, so that its slope is chance."""
-    sizes, most, lines = line_sizes(comparison), 0.1, comparison.reference.lines  # of an amplitude
-    if sizes is None or f not in lines:
-        return False
-    size, sd = sizes.reference[:, lines.index(f)], sizes.wander[:, lines.index(f)].sqrt()
-    return bool((sd > most * size)[size.argmax()])
+    sizes, lines = line_sizes(comparison), comparison.reference.lines
+    return sizes is not None and f in lines and bool(sizes.wanders[lines.index(f)])
 
 
 def _alike(comparison: Comparison, f: float) -> float:

@@ -35,6 +35,13 @@ class LineSizes(NamedTuple):
     wander: Tensor
 
     @property
+    def wanders(self) -> Tensor:
+        """Whether a line has another phase at other times, in the sensor where it is largest, `(line,)`."""
+        most = 0.1  # standard deviations of an amplitude by that, over it
+        size, at = self.reference.max(0)
+        return self.wander.gather(0, at[None])[0] > (most * size).square()
+
+    @property
     def z(self) -> Tensor:
         """Differences in standard deviations, `(sensor, line)`."""
         return (self.observed - self.reference) / torch.hypot(self.sd, self.simulated_sd)
@@ -101,7 +108,11 @@ def _wander(comparison: Comparison) -> Tensor:
     segments = side.signal[..., : parts * length].unflatten(-1, (parts, length))
     segments = (segments - segments.mean(-1, keepdim=True)) * taper
     z = torch.einsum("rskt,lkt->rslk", segments.to(turn.dtype), turn) * (2 / taper.sum())
-    scatter = (z - z.mean(-1, keepdim=True)).abs().square().mean((0, -1)) * (parts / (parts - 1))
+    apart = z - z.mean(-1, keepdim=True)
+    scatter = apart.abs().square().mean((0, -1)) * (parts / (parts - 1))
+    longer = 3  # parts over which a phase goes on
+    follows = sum((apart[..., k:] * apart[..., :-k].conj()).real.mean(0).sum(-1) for k in range(1, longer + 1))
+    scatter = scatter + (2 / parts * torch.as_tensor(follows)).clamp(min=0)
     noise = 4 * taper.square().sum() / taper.sum().square() * comparison.base.spectrum(frequency)
     dof = 2 * len(side.signal) * (parts - 1)
     return torch.where(scatter > noise * float(stats.chi2.isf(rare, dof)) / dof, scatter - noise, 0.0) / parts
