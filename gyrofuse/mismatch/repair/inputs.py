@@ -16,7 +16,6 @@ from gyrofuse.fitting.gmwm_result import GMWMResult
 from gyrofuse.fitting.joint import JointFit
 from gyrofuse.fitting.ranking.result import RankResult
 from gyrofuse.io.recording import Recording
-from gyrofuse.mismatch.detectors.lines.line_sizes import line_sizes
 from gyrofuse.mismatch.detectors.variance.level_spread import with_spread
 from gyrofuse.mismatch.repair.repaired_model import RepairedModel
 from gyrofuse.mismatch.repair.session_model import SessionModel, records_for
@@ -219,8 +218,9 @@ def _lines(simulation: Recording | Tensor | Model | ArrayModel, comparison: Comp
     for _ in range(_SEARCHES):  # the side lobes of strong lines hide weak ones
         if not added(simulated_lines(comparison.knowing(tuple(lines)).reference)):
             break
-    if not named and (sizes := line_sizes(comparison.knowing(tuple(lines)))) is not None:
-        lines = [f for f, wanders in zip(lines, sizes.wanders.tolist(), strict=True) if not wanders]
+    if not named:
+        restless = comparison.wandering(tuple(lines))
+        lines = [f for f in lines if f not in restless]
     strength = amplitudes(comparison.reference.signal, tuple(lines)).mean((0, 1)) if lines else torch.zeros(0)
     return tuple(lines[i] for i in strength.argsort(descending=True).tolist())
 

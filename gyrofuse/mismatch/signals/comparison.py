@@ -15,7 +15,7 @@ from functools import cached_property, partial
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.signals.known_lines import without_lines
+from gyrofuse.mismatch.signals.known_lines import wandering, without_lines
 from gyrofuse.mismatch.signals.lines import FoundLine, simulated_lines, strongest_line, whitened
 from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum
 from gyrofuse.mismatch.signals.psd import Bands, bands
@@ -169,9 +169,21 @@ class Comparison:
         """
         return self.reference.steady_shares(self.bands)
 
+    def wandering(self, lines: tuple[float, ...]) -> tuple[float, ...]:
+        """Those of the simulation's lines, cycles per sample, that have another phase at other times."""
+        return wandering(self.reference.signal, lines, self.base.spectrum(torch.tensor(lines, dtype=torch.float64)))
+
+    @cached_property
+    def _restless(self) -> tuple[float, ...]:
+        return self.wandering(simulated_lines(self.reference))
+
     def steady_share(self, f: Tensor) -> Tensor:
-        """The same at frequencies, cycles per sample."""
-        return self.steady_shares[torch.bucketize(f, self.bands.ends[1]).clamp(max=len(self.steady_shares) - 1)]
+        """The same at frequencies, cycles per sample; 0 next to a line of the simulation that wanders."""
+        share = self.steady_shares[torch.bucketize(f, self.bands.ends[1]).clamp(max=len(self.steady_shares) - 1)]
+        reach = 16 / min(self.n_samples, self.reference.signal.shape[-1])
+        for line in self._restless:
+            share = torch.where((f - line).abs() < reach, 0.0, share)
+        return share
 
     def generator(self) -> torch.Generator:
         """A source of the random numbers of a test, the same for every test of the comparison."""

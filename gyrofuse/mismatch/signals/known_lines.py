@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 
 import torch
+from scipy import stats
 from torch import Tensor
 
 _STRETCH = 2**18  # samples at a time
@@ -32,6 +33,43 @@ def line_parts(signal: Tensor, frequencies: tuple[float, ...]) -> Tensor:
 def amplitudes(signal: Tensor, frequencies: tuple[float, ...]) -> Tensor:
     """Of lines in the middle of signals `(..., time)`, `(..., line)`; of variance `2 S / n` in noise of density `S`."""
     return line_parts(signal, frequencies).abs()
+
+
+def line_wander(records: Tensor, frequencies: tuple[float, ...], density: Tensor) -> Tensor:
+    """Variance of the amplitudes of lines that have another phase at other times, by that, `(sensor, line)`.
+
+    What their scatter over parts of a record is beyond that of noise, over the number of parts; 0 where it is not.
+
+    Args:
+        records: `(record, sensor, time)`.
+        frequencies: Cycles per sample.
+        density: Of the noise at each, per sample, `(sensor, line)`.
+    """
+    parts, rare, longer = 16, 1e-3, 3  # of a record; by chance; parts over which a phase goes on
+    f, length = torch.tensor(frequencies, dtype=torch.float64), records.shape[-1] // parts
+    taper = torch.hann_window(length, periodic=False, dtype=torch.float64)
+    angle = -2 * math.pi * f[:, None] * torch.arange(parts * length, dtype=torch.float64)
+    turn = torch.polar(torch.ones_like(angle), angle).unflatten(-1, (parts, length))
+    segments = records[..., : parts * length].unflatten(-1, (parts, length))
+    segments = (segments - segments.mean(-1, keepdim=True)) * taper
+    z = torch.einsum("rskt,lkt->rslk", segments.to(turn.dtype), turn) * (2 / taper.sum())
+    apart = z - z.mean(-1, keepdim=True)
+    scatter = apart.abs().square().mean((0, -1)) * (parts / (parts - 1))
+    noise = 4 * taper.square().sum() / taper.sum().square() * density
+    dof = 2 * len(records) * (parts - 1)
+    follows = [(apart[..., k:] * apart[..., :-k].conj()).real.mean(0).sum(-1) for k in range(1, longer + 1)]
+    wander = (scatter - noise + 2 / parts * torch.stack(follows).sum(0).clamp(min=0)) / parts
+    return torch.where(scatter > noise * float(stats.chi2.isf(rare, dof)) / dof, wander, 0.0)
+
+
+def wandering(records: Tensor, frequencies: tuple[float, ...], density: Tensor) -> tuple[float, ...]:
+    """Those of lines that have another phase at other times, in the sensor where they are largest; as `line_wander`."""
+    most = 0.1  # standard deviations of an amplitude by that, over it
+    if not frequencies:
+        return ()
+    size, at = amplitudes(records, frequencies).mean(0).max(0)
+    far = line_wander(records, frequencies, density).gather(0, at[None])[0] > (most * size).square()
+    return tuple(f for f, wanders in zip(frequencies, far.tolist(), strict=True) if wanders)
 
 
 def resized(signal: Tensor, frequency: float, amplitude: Tensor) -> Tensor:

@@ -28,7 +28,6 @@ from gyrofuse.mismatch.detectors.lines.demodulation import (
     slope_variance,
     turn_by,
 )
-from gyrofuse.mismatch.detectors.lines.line_sizes import line_sizes
 from gyrofuse.mismatch.detectors.lines.lost_samples import Loss, losses_of, paths_of, put_back
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.signals.comparison import Comparison
@@ -133,7 +132,7 @@ def strongest_slip(comparison: Comparison) -> Slip | None:
     simulated = [
         slip.among(_alike(comparison, f))
         for f in shared[:3]
-        if not _wanders(comparison, f) and (slip := _from_simulated(comparison, f)) is not None
+        if not comparison.wandering((f,)) and (slip := _from_simulated(comparison, f)) is not None
     ]
     if not tones and not simulated:
         return None
@@ -190,12 +189,6 @@ def _in_both(comparison: Comparison, f: float) -> bool:
     theirs = _power_and_energy(demodulated(white, f))[0].clamp(min=0).sum()
     own = _power_and_energy(demodulated(comparison.white, f))[0].clamp(min=0).sum()
     return float(own / comparison.n_samples) > least * float(theirs / white.shape[-1])
-
-
-def _wanders(comparison: Comparison, f: float) -> bool:
-    """Whether a line of the simulation has another phase at other times, so that its slope is chance."""
-    sizes, lines = line_sizes(comparison), comparison.reference.lines
-    return sizes is not None and f in lines and bool(sizes.wanders[lines.index(f)])
 
 
 def _alike(comparison: Comparison, f: float) -> float:
