@@ -278,16 +278,26 @@ def _back_from_wander(z: Tensor) -> Tensor:
     return turn if bool((gained > 2 * by_chance + NATS_AS_GOOD)[loud].all()) else torch.ones_like(turn)
 
 
+def _in_step(z: Tensor) -> bool:
+    """Whether the phase of a tone `(row, block)` wanders, alike in every sensor that has much of it."""
+    power, straight = _power_and_energy(z)
+    loud, least = power > power.max() / 20, 0.97  # share of what has one phase against the loudest
+    size = z.abs() * z[power.argmax()].abs()
+    alike = (z * z[power.argmax()].conj()).sum(-1).abs() > least * size.sum(-1)
+    return bool((straight < _IN_PHASE * power)[loud].any()) and bool(alike[loud].all())
+
+
 def _of_tone(comparison: Comparison, f: float, others: tuple[float, ...]) -> list[Slip]:
     """A skew and a loss of samples, as a tone of about `f` cycles per sample shows them, beside other ones."""
     z = demodulated(
         whitened(without_lines(comparison.recording, others), comparison.base) if others else comparison.white, f
     )
+    in_step = _in_step(z)
     z = z * _course(z)
     z = z * _back_from_wander(z)
     length = comparison.n_samples // BLOCKS * BLOCKS
     found = _reference(comparison, f, float(energy_by_slope(z).amax()))
-    if found is None and len(z) < 2:
+    if found is None and (len(z) < 2 or in_step):
         return []
     name, slope, of_reference = found or (None, 0.0, 0.0)
     z = z * turn_by(-slope)
