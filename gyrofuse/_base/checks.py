@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from numbers import Real
 
 import torch
@@ -84,6 +85,13 @@ def check_positive_integer(name: str, value: int) -> int:
     if isinstance(value, bool) or not isinstance(value, Real) or value < 1 or value % 1 != 0:
         raise ValueError(f"`{name}`: expected a whole number >= 1, got {value!r}")
     return int(value)
+
+
+def check_batch(batch: Sequence[int]) -> tuple[int, ...]:
+    """Return a shape of independent draws as a tuple."""
+    if not isinstance(batch, Sequence) or isinstance(batch, str):
+        raise ValueError(f"`batch`: expected a shape such as (3,) or (), got {batch!r}")
+    return tuple(check_n_samples("batch", size) for size in batch)
 
 
 def check_length(n_samples: int, *, recorded: bool) -> int:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -72,7 +74,12 @@ def rank(
         files.write_report(lambda: rank_report(result, part, title=title, remarks=remarks))
         files.write_json(result.to_dict)
     say("\n".join([result.summary(), *remarks]))
-    fits = [fit for fit in result.best if fit is not None]
+    places = itertools.product(*map(range, result.choice.shape))
+    fits = [
+        replace(fit, sensors=(sensor_label(result.sensors, place, result.axes),))
+        for place, fit in zip(places, result.best, strict=True)
+        if fit is not None
+    ]
     if len(fits) <= _MOST_FITS:
         say("\n".join(f"\n{fit}" for fit in fits))
     if notes := files.note:

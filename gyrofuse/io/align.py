@@ -85,7 +85,8 @@ def align(grids: Sequence[Grid], names: Sequence[str], source: str) -> tuple[lis
                 "left out where it slips",
                 samples=slip,
             )
-        if clocked and grid is not reference:
+        seen = 0.005  # of a step: what is printed of it
+        if clocked and grid is not reference and max(abs(offset), abs(slip)) >= seen:
             rest = offset + slip / 2 - round(offset + slip / 2)
             book.add(
                 "offset",

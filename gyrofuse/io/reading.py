@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -66,6 +66,8 @@ def read_recording(
         ValueError: An option that does not fit the log, or a file that is named twice.
         ImportError: A format whose library is not installed (the extra `logs`); the message names it.
     """
+    if not isinstance(path, str | os.PathLike | Iterable):
+        raise TypeError(f"`path`: expected the path of a file, or of several, got {path!r}")
     paths = [Path(path)] if isinstance(path, str | Path) else [Path(p) for p in path]
     if not paths:
         raise ValueError("`path`: expected at least one file, got none")

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gyrofuse._base.checks import check_positive_integer, own_generator
+from gyrofuse._base.checks import check_batch, check_positive_integer, own_generator
 from gyrofuse.noise.estimation import EstimatedFrom
 from gyrofuse.noise.processes import Drift, Model, Process
 
@@ -166,7 +166,7 @@ class ArrayModel:
         """
         n_samples = check_positive_integer("n_samples", n_samples)
         generator = own_generator(generator, device)
-        shape = (*batch, self.n_sensors, n_samples)
+        shape = (*check_batch(batch), self.n_sensors, n_samples)
         signal = torch.zeros(shape, dtype=torch.float64, device=generator.device)
         for process, matrix in self.components:
             root = _root(matrix).to(generator.device)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.func import jvp
 
-from gyrofuse._base.checks import check_positive, check_positive_integer, own_generator
+from gyrofuse._base.checks import check_batch, check_positive, check_positive_integer, own_generator
 from gyrofuse.noise.estimation import EstimatedFrom
 
 Parameter = float | Tensor | None
@@ -217,7 +217,7 @@ class Model:
         generator = own_generator(generator, device)
         known = self._known(generator.device)
         own = torch.broadcast_shapes(*(v.shape[:-1] for _, columns in known for v in columns.values()))
-        shape = torch.Size([*batch, *own])
+        shape = torch.Size([*check_batch(batch), *own])
         return _sum([p._path(n_samples, shape, generator, **columns) for p, columns in known]).to(dtype)
 
     def to_dict(self) -> dict[str, Any]:

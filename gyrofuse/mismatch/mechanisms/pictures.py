@@ -175,7 +175,8 @@ def values(ax: Axes, comparison: Comparison, sensor: int, centre: float, width: 
         centre, width: Middle and half width of the picture, unit of the signal.
     """
     handles = []
-    for signal, style in _as_one_mean(comparison, sensor):
+    own, other = comparison.recording[sensor], comparison.reference.signal[0, sensor]
+    for signal, style in ((own, _RECORDED), (other - other.mean() + own.mean(), _LINE)):
         share, edges = np.histogram(signal.numpy(), np.linspace(centre - width, centre + width, 201))
         handles.append(ax.stairs(share / signal.numel(), edges, **style))
     label = with_unit("value", comparison.info.measure)
@@ -192,18 +193,12 @@ def distance_from_grid(ax: Axes, comparison: Comparison, sensor: int, step: floa
         step, offset: Of the grid, unit of the signal.
     """
     handles = []
-    for signal, style in _as_one_mean(comparison, sensor):
+    own, other = comparison.recording[sensor], comparison.reference.signal[0, sensor]  # no mean is taken off a grid
+    for signal, style in ((own, _RECORDED), (other, _LINE)):
         steps = (signal - offset) / step
         density, edges = np.histogram((steps - steps.round()).numpy(), np.linspace(-0.505, 0.505, 102), density=True)
         handles.append(ax.stairs(density, edges, **style))
     _finish(ax, handles, ["recording", "simulation"], "distance from the grid (steps)", "density")
-
-
-def _as_one_mean(comparison: Comparison, sensor: int) -> list[tuple[Tensor, dict[str, Any]]]:
-    """Recording and first record of the simulation, `(time,)` each, with the mean of the recording, and their looks."""
-    own, other = comparison.recording[sensor], comparison.reference.signal[0, sensor]
-    shift = float(other.mean() - own.mean())  # by which a grid of the simulation is shifted as well
-    return [(own, _RECORDED), (other - shift, _LINE)]
 
 
 def samples(ax: Axes, comparison: Comparison, sensor: int, first: int, count: int) -> None:
