@@ -221,7 +221,7 @@ EVERY = (
         torch.tensor([[[9.0, 1.0], [1.0, 1 / 3]], [[2.0, 0.0], [0.0, 3.0]]], dtype=torch.float64),
         numbers(0.1, 0.3),
     ),
-    VarianceChange(((1.5, 3.25), (6.0, 7.0)), numbers(2.0, 1.0), 1 / 3),
+    VarianceChange(((1.5, 3.25), (6.0, 7.0)), numbers(2.0, 1.0), 1 / 3, (20.0,)),
     GradualChange(numbers(0.0, 1 / 3, 9.0), numbers(0.0, 0.7, 1.0), numbers(0.9, 1.0), numbers(1 / 3, 1.0), 0.1),
     ParameterShift(BASE, torch.tensor([[0.1, 0.0], [1 / 3, 0.0], [0.0, 0.0], [0.2, 0.1]], dtype=torch.float64)),
     LowPassFilter("pole", numbers(0.7, 0.0)),

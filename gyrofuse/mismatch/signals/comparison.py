@@ -269,8 +269,13 @@ class Comparison:
         return replace(self, reference=replace(self.reference, signal=signal), analog=analog, converter=converter)
 
     def made_louder(self, known: VarianceCourse) -> Comparison:
-        """With a course of the level built into the simulation, and known of both sides where noise is looked at."""
-        built = self.apply(lambda signal: known.of_length(signal.shape[-1]).added(signal))
+        """With a course of the level built into the noise of the simulation, and known where noise is looked at."""
+
+        def louder(signal: Tensor) -> Tensor:
+            noise = without_lines(signal, self.reference.lines)
+            return signal - noise + known.of_length(signal.shape[-1]).added(noise)
+
+        built = self.apply(louder)
         observed, reference = (
             replace(side, loud=(*side.loud, known.of_length(side.signal.shape[-1])))
             for side in (built.observed, built.reference)

@@ -13,6 +13,7 @@ from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.folds import estimation_samples, held_out_blocks
+from gyrofuse.mismatch.signals.known_lines import without_lines
 from gyrofuse.mismatch.signals.variance_course import (
     VarianceCourse,
     fast_factor,
@@ -27,7 +28,11 @@ MOSTLY = 0.5  # of the way of a course
 
 
 class ChangingVariance(Mechanism):
-    """Fast noise whose variance takes a course over the time of this recording."""
+    """Fast noise whose variance takes a course over the time of this recording.
+
+    Attributes:
+        lines_hz: Lines of the simulation, which are no noise and stay as they are.
+    """
 
     name: ClassVar[str] = "variance_change"
     likelihood: ClassVar[str] = "regimes"
@@ -35,6 +40,7 @@ class ChangingVariance(Mechanism):
     separated_by: ClassVar[str] = "a longer recording with more than one change"
     happened_once: ClassVar[bool] = True
     changes_noise: ClassVar[bool] = True
+    lines_hz: tuple[float, ...]
 
     def course(self, n_samples: int, info: RecordingInfo) -> VarianceCourse:
         """The course of the variance in a record of `n_samples`."""
@@ -45,11 +51,17 @@ class ChangingVariance(Mechanism):
         pictures.variance_over_time(ax, comparison, sensor, course)
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
-        return self.course(signal.shape[-1], info).added(signal)
+        noise = without_lines(signal, tuple(f / info.rate for f in self.lines_hz))
+        return signal - noise + self.course(signal.shape[-1], info).added(noise)
 
     def repair(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
         """At the same share of records that are longer or shorter, so that these have as much of the course."""
         return comparison.made_louder(self.course(comparison.n_samples, comparison.info))
+
+
+def lines_of(comparison: Comparison) -> tuple[float, ...]:
+    """Lines of the simulation that stand still, Hz."""
+    return tuple(f * comparison.info.rate for f in comparison.reference.lines)
 
 
 class LevelCourse(ChangingVariance):

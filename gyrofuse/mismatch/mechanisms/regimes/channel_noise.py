@@ -24,6 +24,7 @@ from gyrofuse.mismatch.mechanisms.mechanism import Finding
 from gyrofuse.mismatch.mechanisms.regimes.changing_variance import (
     MOSTLY,
     LevelCourse,
+    lines_of,
     of_the_fast_noise,
     over_the_simulation,
 )
@@ -67,6 +68,7 @@ class ChannelNoise(LevelCourse):
     base: OfSensors
     factor: OfSensors
     corner_hz: float
+    lines_hz: tuple[float, ...] = ()
 
     @classmethod
     def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
@@ -102,7 +104,7 @@ class ChannelNoise(LevelCourse):
             return None
         known = _as_it_goes(of_the_fast_noise(comparison, course, course.share > MOSTLY), course)
         base = over_the_simulation(comparison, known)
-        effect = cls(name, row, kind, ends, bend, base, known.factor, known.corner * info.rate)
+        effect = cls(name, row, kind, ends, bend, base, known.factor, known.corner * info.rate, lines_of(comparison))
         sensors = tuple((known.factor != 1).nonzero()[:, 0].tolist())
         parameters = {}
         for i in sensors:

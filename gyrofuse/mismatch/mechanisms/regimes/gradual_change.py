@@ -21,6 +21,7 @@ from gyrofuse.mismatch.mechanisms.mechanism import Finding
 from gyrofuse.mismatch.mechanisms.regimes.changing_variance import (
     MOSTLY,
     LevelCourse,
+    lines_of,
     of_the_fast_noise,
     over_the_simulation,
 )
@@ -71,6 +72,7 @@ class GradualChange(LevelCourse):
     base: OfSensors
     factor: OfSensors
     corner_hz: float
+    lines_hz: tuple[float, ...] = ()
 
     @classmethod
     def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
@@ -106,7 +108,7 @@ class GradualChange(LevelCourse):
         known = of_the_fast_noise(comparison, course, peak)
         share, factor, corner, base = known.course, known.factor, known.corner, over_the_simulation(comparison, known)
         knots = torch.tensor([0, *(share.diff().diff().abs() > _KINK).nonzero()[:, 0] + 1, comparison.n_samples - 1])
-        effect = cls(knots / rate, share[knots], base, factor, corner * rate)
+        effect = cls(knots / rate, share[knots], base, factor, corner * rate, lines_of(comparison))
         sensors = tuple((factor != 1).nonzero()[:, 0].tolist())
         reach = Z * course.log_factor_sd
         rises = float(share[peak].mean()) > float(share[~peak].mean())

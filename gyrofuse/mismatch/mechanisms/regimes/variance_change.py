@@ -20,7 +20,7 @@ from gyrofuse.mismatch.detectors.variance.noise_level import (
 )
 from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
 from gyrofuse.mismatch.mechanisms.mechanism import Finding
-from gyrofuse.mismatch.mechanisms.regimes.changing_variance import ChangingVariance
+from gyrofuse.mismatch.mechanisms.regimes.changing_variance import ChangingVariance, lines_of
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.dims import OfSensors
@@ -65,6 +65,7 @@ class VarianceChange(ChangingVariance):
     episodes: tuple[tuple[float, float], ...]
     factor: OfSensors
     corner_hz: float = 0.0
+    lines_hz: tuple[float, ...] = ()
 
     @classmethod
     def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
@@ -82,7 +83,7 @@ class VarianceChange(ChangingVariance):
         corner = corner_of(comparison.observed.noise[0], found.inside(comparison.n_samples), found.factor)
         episodes = tuple((e.start / rate, e.stop / rate) for e in found.episodes)
         factor = torch.where(found.factor != 1, fast_factor(found.factor, corner), 1.0)
-        effect = cls(episodes, factor, corner * rate)
+        effect = cls(episodes, factor, corner * rate, lines_of(comparison))
         sensors = tuple((found.factor != 1).nonzero()[:, 0].tolist())
         parameters = {
             name: _time(limits, rate) for name, limits in (("start", posterior.start), ("stop", posterior.stop))
