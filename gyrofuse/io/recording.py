@@ -67,6 +67,8 @@ class Recording:
         fill(self, "rate", check_positive("rate", self.rate))
         fill(self, "sensors", tuple(self.sensors) or numbered(n_sensors))
         fill(self, "axes", tuple(self.axes))
+        if not isinstance(self.unit, str):
+            raise ValueError(f'`unit`: expected a unit such as "deg/s", or "unknown", got {self.unit!r}')
         measured = quantity_of(self.unit)
         fill(self, "quantity", self.quantity or measured or "rate")
         if self.quantity not in QUANTITIES or measured not in (None, self.quantity):

@@ -225,3 +225,19 @@ def test_what_was_guessed_on_reading_stands_on_the_page(run: Run, tmp_path: Path
     page = (tmp_path / "page.html").read_text()
     assert "the log states 50 Hz, the timestamps give 100 Hz, which is used" in page
     assert "time column &#39;time&#39; states no unit: read as s" in page
+
+
+def test_corrected_axes_of_a_device_stay_its_axes(run: Run):
+    noise = torch.stack([drawn(N, seed)[:1].expand(3, -1) * torch.tensor([[1.0], [2.0], [0.5]]) for seed in (1, 2)])
+    noise = noise + torch.randn(noise.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    noise[0, 1] += torch.cos(2 * math.pi * 7.3 / RATE * torch.arange(N, dtype=torch.float64))
+    for name, x in zip(("imu", "sim"), noise, strict=True):
+        made = gf.Recording(x[:, None], rate=RATE, unit="deg/s", sensors=("imu",), axes=("x", "y", "z"))
+        made.save(f"{name}.npz")
+    done = run("diagnose", "imu.npz", "--simulation", "sim.npz", "--corrected", "clean.npz")
+    assert (done.status, done.err) == (0, "")
+    clean, came = gf.read_recording("clean.npz"), gf.read_recording("imu.npz")
+    assert (clean.sensors, clean.axes) == (("imu",), ("x", "y", "z"))
+    report = gf.diagnose(came, gf.read_recording("sim.npz"))
+    torch.testing.assert_close(report.correct(came).signal, clean.signal)
+    assert not torch.equal(clean.signal, came.signal)

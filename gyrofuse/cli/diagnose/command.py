@@ -105,7 +105,10 @@ def diagnose(
         )
     groups = [[log] for log in logs] if several else [logs]
     with writing.files(inputs, corrected=corrected, model_out=model_out) as files:
-        recordings = [as_the_model(_one_axis(reading.read(group), titled(group)), simulation) for group in groups]
+        came = [reading.read(group) for group in groups]
+        recordings = [
+            as_the_model(_one_axis(one, titled(group)), simulation) for one, group in zip(came, groups, strict=True)
+        ]
         simulated = _simulation(simulation, recordings[0], reading)
         judging = None
         if judge is not None:
@@ -124,7 +127,7 @@ def diagnose(
         else:
             found, remarks = search.one(names[0], parts[names[0]], twins)
             if corrected:
-                remarks += _save_corrected(found, parts[names[0]], corrected, files.draft("corrected"))
+                remarks += _save_corrected(found, parts[names[0]], came[0], corrected, files.draft("corrected"))
         remarks += _units_taken(recordings[0], simulated, (names[0], simulation.name))
         files.write_json(lambda: found.model.to_dict(), "model-out")
         if writing.report:
@@ -146,11 +149,18 @@ def diagnose(
         say_notes(one)
 
 
-def _save_corrected(report: MismatchReport, recording: Recording, path: Path, draft: Path) -> list[str]:
-    """Save a recording without what can be taken off it; a remark where that is nothing."""
+def _save_corrected(
+    report: MismatchReport, recording: Recording, came: Recording, path: Path, draft: Path
+) -> list[str]:
+    """Save a recording, which came in another shape, without what can be taken off it; a remark where that is nothing.
+
+    Axes of a device, each of which was diagnosed by itself, are its axes again.
+    """
     whole, _ = without_gaps(recording, "", 0)
     clean = report.correct(whole)
-    clean.save(draft, force=True)
+    of_device = came.n_sensors == 1 and set(clean.sensors) == set(came.axes)
+    as_it_came = replace(clean, signal=clean.signal[:, None], sensors=came.sensors, axes=clean.sensors)
+    (as_it_came if of_device else clean).save(draft, force=True)
     if not torch.equal(clean.signal, whole.signal):
         return []
     return [f"Nothing was found that can be taken off: {path} is the recording as it came."]

@@ -61,7 +61,7 @@ class Outcome:
             ValueError: Other sensors than those of the diagnosis, or another sampling rate.
         """
         info = self.model.info
-        signal = recording.signal if isinstance(recording, Recording) else recording
+        signal = recording.axes_as_sensors().signal if isinstance(recording, Recording) else recording
         if signal.ndim < 2 or signal.shape[-2] != len(info.sensors):
             raise ValueError(
                 f"`recording`: expected (sensor, time) with the {len(info.sensors)} sensors of the diagnosis, got "
@@ -77,7 +77,8 @@ class Outcome:
         other_unit = recording.unit != info.unit and "unknown" not in (recording.unit, info.unit)
         converted = recording.to(info.unit) if other_unit else recording
         own = replace(self.model, info=replace(info, channels={**info.channels, **recording.channels}))
-        corrected = replace(converted, signal=own.correct(converted.signal.double()).to(signal.dtype))
+        made = own.correct(converted.axes_as_sensors().signal.double()).to(signal.dtype)
+        corrected = replace(converted, signal=made.view_as(converted.signal))
         return corrected.to(recording.unit) if other_unit else corrected
 
     def benefit(self, scale_weights: ScaleWeights = "long") -> Benefit:

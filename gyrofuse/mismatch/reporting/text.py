@@ -200,10 +200,11 @@ def typeset(sentence: str) -> str:
 
 def family_words(held_out: HeldOut) -> str:
     """Held-out log scores, likelihood by likelihood: each is of data of its own, and they are not added up."""
-    return ", ".join(
+    words = [
         f"{name} by {nats(score.value)} nats (95 % interval {nats(score.low)} to {nats(score.high)})"
         for name, score in held_out.families.items()
-    )
+    ]
+    return ", ".join(words) or "none, as nothing was repaired"
 
 
 def paired_words(held_out: HeldOut) -> str:
