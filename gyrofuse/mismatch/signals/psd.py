@@ -256,7 +256,7 @@ def steady_shares(records: Tensor, wanted: Bands) -> Tensor:
     dof = parts - 3  # of a record: a mean is subtracted
     excess = course.var(-2).sum(0) * dof * ordinates / parts  # chi-square, (sensor, band)
     dof *= n_records
-    certain = excess > float(stats.chi2.isf(rare / p, dof))
+    certain = excess > float(stats.chi2.isf(rare / (p * len(wide)), dof))
     apart = course - course.mean(-2, keepdim=True)
     follows = sum((apart[..., k:, :] * apart[..., :-k, :]).sum((0, -2)) for k in (1, 2))
     longer = (1 + 2 * torch.as_tensor(follows) / apart.square().sum((0, -2)).clamp(min=1e-300)).clamp(min=1)
