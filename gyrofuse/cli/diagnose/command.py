@@ -158,10 +158,11 @@ def _save_corrected(
     """
     whole, _ = without_gaps(recording, "", 0)
     clean = report.correct(whole)
-    of_device = came.n_sensors == 1 and set(clean.sensors) == set(came.axes)
-    as_it_came = replace(clean, signal=clean.signal[:, None], sensors=came.sensors, axes=clean.sensors)
-    (as_it_came if of_device else clean).save(draft, force=True)
-    if not torch.equal(clean.signal, whole.signal):
+    changed = not torch.equal(clean.signal, whole.signal)
+    if came.n_sensors == 1 and set(clean.sensors) == set(came.axes):
+        clean = replace(clean, signal=clean.signal[:, None], sensors=came.sensors, axes=clean.sensors)
+    clean.save(draft, force=True)
+    if changed:
         return []
     return [f"Nothing was found that can be taken off: {path} is the recording as it came."]
 
