@@ -270,12 +270,8 @@ class Comparison:
 
     def made_louder(self, known: VarianceCourse) -> Comparison:
         """With a course of the level built into the noise of the simulation, and known where noise is looked at."""
-
-        def louder(signal: Tensor) -> Tensor:
-            noise = without_lines(signal, self.reference.lines)
-            return signal - noise + known.of_length(signal.shape[-1]).added(noise)
-
-        built = self.apply(louder)
+        lines = self.reference.lines
+        built = self.apply(lambda signal: known.of_length(signal.shape[-1]).added(signal, lines))
         observed, reference = (
             replace(side, loud=(*side.loud, known.of_length(side.signal.shape[-1])))
             for side in (built.observed, built.reference)

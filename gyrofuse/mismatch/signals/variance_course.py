@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.signals.filters import filtered
+from gyrofuse.mismatch.signals.known_lines import without_lines
 from gyrofuse.mismatch.signals.psd import bands, cross_spectra
 
 _CORNER = 1 / 64  # cycles per sample, for stretches too short to determine it
@@ -43,9 +44,10 @@ class VarianceCourse:
         n = len(self.course)
         return self if n_samples == n else replace(self, course=self.course[torch.arange(n_samples) * n // n_samples])
 
-    def added(self, signal: Tensor) -> Tensor:
-        """Signals `(..., sensor, time)` with it."""
-        return self._times(signal, 0.5)
+    def added(self, signal: Tensor, lines: tuple[float, ...] = ()) -> Tensor:
+        """Signals `(..., sensor, time)` with it; lines, cycles per sample, are no noise and stay as they are."""
+        noise = without_lines(signal, lines)
+        return signal - noise + self._times(noise, 0.5)
 
     def taken_off(self, signal: Tensor) -> Tensor:
         """Signals `(..., sensor, time)` that have it, without."""

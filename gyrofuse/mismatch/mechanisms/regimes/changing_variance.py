@@ -13,7 +13,6 @@ from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.folds import estimation_samples, held_out_blocks
-from gyrofuse.mismatch.signals.known_lines import without_lines
 from gyrofuse.mismatch.signals.variance_course import (
     VarianceCourse,
     fast_factor,
@@ -51,8 +50,8 @@ class ChangingVariance(Mechanism):
         pictures.variance_over_time(ax, comparison, sensor, course)
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
-        noise = without_lines(signal, tuple(f / info.rate for f in self.lines_hz))
-        return signal - noise + self.course(signal.shape[-1], info).added(noise)
+        lines = tuple(f / info.rate for f in self.lines_hz)
+        return self.course(signal.shape[-1], info).added(signal, lines)
 
     def repair(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
         """At the same share of records that are longer or shorter, so that these have as much of the course."""
