@@ -15,7 +15,9 @@ from torch import Tensor
 from gyrofuse import AR1, RandomWalk, WhiteNoise
 from gyrofuse.mismatch.likelihoods.telegraph import (
     _LARGEST,
+    CLOSE,
     Background,
+    Spacing,
     _filter,
     _thinned,
     backgrounds,
@@ -60,9 +62,14 @@ def telegraph(seed: int) -> Comparison:
     return drawn(seed, LEVELS.half * _path(N, LEVELS.up, LEVELS.down, g))
 
 
-def covariance(n: int) -> np.ndarray:
+def places(n: int, spacing: Spacing = CLOSE) -> np.ndarray:
+    """Where blocks lie, blocks after the first."""
+    return np.cumsum([spacing.before(k) for k in range(n)]) - 1
+
+
+def covariance(n: int, spacing: Spacing = CLOSE) -> np.ndarray:
     """Of block means in `BACKGROUND`, part by part."""
-    k = np.arange(n)
+    k = places(n, spacing)
     lag, earlier = np.abs(k[:, None] - k), np.minimum(k[:, None], k)
     ar1s = sum(v * p**lag for v, p in zip(START, PHI[:2], strict=False))
     return np.asarray(ar1s + _LARGEST + STEPS[2] * (earlier + 1) + WHITE * np.eye(n))
@@ -83,19 +90,37 @@ def test_the_rival_has_the_likelihood_of_the_normal_law() -> None:
         assert mine == pytest.approx(log_density(y, np.full(30, y.mean()), matrix), abs=1e-6)
 
 
-def every_path(y: np.ndarray, half: float, up: float, down: float, noise: np.ndarray) -> float:
-    """Summed over all paths; of blocks in which the level moves it may be anywhere between."""
-    n = len(y)
+def test_runs_of_blocks_that_lie_apart_have_the_likelihood_of_the_normal_law() -> None:
+    y, spacing = np.random.default_rng(1).normal(size=30), Spacing(10, 7.5)
+    lag = np.abs(places(30, spacing)[:, None] - places(30, spacing))
+    assert places(30, spacing)[10] - places(30, spacing)[9] == 7.5
+    for sd, tau in ((0.0, 1.0), (0.9, 4.0)):
+        matrix = covariance(30, spacing) + sd**2 * np.exp(-lag / tau)
+        mine = gaussian_values(y, BACKGROUND, np.array([sd, 2.0]), np.array([tau, 7.0]), spacing)[0].sum()
+        assert mine == pytest.approx(log_density(y, np.full(30, y.mean()), matrix), abs=1e-6)
+
+
+def every_path(
+    y: np.ndarray, half: float, up: float, down: float, noise: np.ndarray, spacing: Spacing = CLOSE
+) -> float:
+    """Summed over all paths; of blocks in which the level moves it may be anywhere between.
+
+    Of two runs that lie apart the second starts at a level of its own.
+    """
+    n, apart = len(y), spacing.gap > 1
     rates = np.array([[-1 / up, 1 / up], [1 / down, -1 / down]])
     move = linalg.expm(rates)  # from upper and lower, after a block
-    paths = np.array(list(itertools.product((0, 1), repeat=n + 1)))  # one block ahead of the first
+    unseen = linalg.expm(rates * (spacing.gap - 1))
+    paths = np.array(list(itertools.product((0, 1), repeat=n + 1 + apart)))  # one block ahead of the first
+    ends = np.delete(np.arange(n + 1 + apart), [0, spacing.run + 1] if apart else [0])
     prior = np.where(paths[:, 0] == 0, up, down) / (up + down)
     total = 0.0
     for path, p in zip(paths, prior, strict=True):
-        level, moves = half * (1 - 2 * path), path[:-1] != path[1:]
+        level, moves = half * (1 - 2 * path), path[ends - 1] != path[ends]
         matrix = noise + np.diag(moves * half**2 / 3)
-        density = log_density(y - (level[:-1] + level[1:]) / 2, np.full(n, y.mean()), matrix)
-        total += p * move[path[:-1], path[1:]].prod() * math.exp(float(density))
+        density = log_density(y - (level[ends - 1] + level[ends]) / 2, np.full(n, y.mean()), matrix)
+        between = unseen[path[spacing.run], path[spacing.run + 1]] if apart else 1.0
+        total += p * between * move[path[ends - 1], path[ends]].prod() * math.exp(float(density))
     return math.log(total)
 
 
@@ -110,6 +135,17 @@ def test_the_likelihood_of_two_levels_sums_over_all_paths() -> None:
         assert all_paths[0] == pytest.approx(truth, abs=tolerance)
         assert all_paths[1] == pytest.approx(every_path(y, 0.3, 2.0, 9.0, noise), abs=tolerance)
         assert switching_values(y, background, *numbers, 64).sum(-1)[0] == pytest.approx(truth, abs=0.1)
+
+
+def test_paths_of_runs_that_lie_apart_are_summed_over_what_lies_between() -> None:
+    y = np.random.default_rng(2).normal(size=8) * 0.7 + np.repeat([1, -1], 4)
+    white = Background(WHITE, PHI, 0 * STEPS, 0 * START)
+    for gap in (1.0, 3.5, 1e3):
+        spacing = Spacing(5, gap)
+        numbers = (np.array([1.0]), np.array([4.0]), np.array([6.0]))
+        mine = switching_values(y, white, *numbers, 1024, spacing)[0].sum()
+        truth = every_path(y, 1.0, 4.0, 6.0, WHITE * np.eye(8), spacing)
+        assert mine == pytest.approx(truth, abs=1e-9)
 
 
 def test_thinning_keeps_the_heavy_and_is_unbiased() -> None:
@@ -315,3 +351,19 @@ def test_sensors_that_jump_by_themselves_share_nothing():
     assert found is not None
     assert isinstance(found.effect, RandomTelegraph)
     assert found.effect.signs == ()
+
+
+def test_fast_jumps_in_a_long_record_are_seen_in_the_beginnings_of_its_parts() -> None:
+    """Blocks over all of the record would be longer than the levels last."""
+    n, levels = 40_000, Numbers(2.0, 40.0, 30.0)
+    g = torch.Generator().manual_seed(7)
+    recording = NOISE.simulate(n, batch=(2,), generator=g)
+    recording[1] += levels.half * _path(n, levels.up, levels.down, g)
+    comparison = Comparison.of(SCENE, recording, NOISE.simulate(n, batch=(2, 2), generator=g))
+    fit = two_levels(comparison)[1]
+    assert fit.means.spacing.gap > 1
+    assert len(fit.means.y) == 2048
+    assert fit.resolved
+    assert fit.over > 100
+    reach = np.exp(3 * np.array(fit.log_sd))
+    assert (np.abs(np.log(np.array(fit.best) / np.array(levels))) < np.log(reach)).all()

@@ -30,6 +30,25 @@ Array = NDArray[np.float64]
 _LARGEST = 1e4  # variance of the level at the start over that of the noise: a diffuse prior, without loss of digits
 
 
+class Spacing(NamedTuple):
+    """Runs of block means that follow each other, and what lies between the runs.
+
+    Attributes:
+        run: Blocks in a run.
+        gap: From the last block of a run to the first of the next one, blocks; 1 where they follow each other, too.
+    """
+
+    run: int
+    gap: float
+
+    def before(self, k: int) -> float:
+        """From the block before to block `k`, blocks."""
+        return self.gap if k and k % self.run == 0 else 1.0
+
+
+CLOSE = Spacing(1, 1.0)  # blocks that all follow each other
+
+
 class Background(NamedTuple):
     """Noise of one sensor's block means: white noise, AR1s, a random walk.
 
@@ -44,6 +63,12 @@ class Background(NamedTuple):
     phi: Array
     steps: Array
     start: Array
+
+    def steps_over(self, blocks: float) -> Array:
+        """Variances of the steps over some blocks, `(part,)`."""
+        rest = 1 - self.phi**2
+        grown = np.where(rest > 0, (1 - self.phi ** (2 * blocks)) / np.where(rest > 0, rest, 1.0), blocks)
+        return np.asarray(self.steps * grown)
 
 
 def backgrounds(base: NoiseSpectrum, block: int, n_shaped: int = 4) -> list[Background]:
@@ -87,7 +112,7 @@ def _starting_level(y: Array) -> float:
     return float(y[:50].mean())
 
 
-def gaussian_values(y: Array, background: Background, sd: Array, tau: Array) -> Array:
+def gaussian_values(y: Array, background: Background, sd: Array, tau: Array, spacing: Spacing = CLOSE) -> Array:
     """Log likelihoods of an Ornstein-Uhlenbeck process in the background, `(trial, block)`, by Kalman's filter.
 
     Args:
@@ -95,18 +120,26 @@ def gaussian_values(y: Array, background: Background, sd: Array, tau: Array) -> 
         background: Noise beside it.
         sd: Standard deviation of the process, `(trial,)`; 0 for none.
         tau: Time constant of it, blocks.
+        spacing: Where the block means lie.
     """
     n_trials, parts = len(sd), len(background.phi) + 1
-    own = np.exp(-1 / tau)
-    phi = np.column_stack([np.tile(background.phi, (n_trials, 1)), own])
-    steps = np.column_stack([np.tile(background.steps, (n_trials, 1)), sd**2 * (1 - own**2)])
+
+    def over(blocks: float) -> tuple[Array, Array, Array]:
+        """Coefficients `(trial, part)`, their products, and variances of steps over some blocks."""
+        own = np.exp(-blocks / tau)
+        phi = np.column_stack([np.tile(background.phi**blocks, (n_trials, 1)), own])
+        steps = np.column_stack([np.tile(background.steps_over(blocks), (n_trials, 1)), sd**2 * (1 - own**2)])
+        return phi, phi[:, :, None] * phi[:, None], steps
+
+    moves = {blocks: over(blocks) for blocks in {1.0, spacing.gap}}
     diagonal = np.arange(parts)
     p = np.zeros((n_trials, parts, parts))
     p[:, diagonal, diagonal] = np.column_stack([np.tile(background.start, (n_trials, 1)), sd**2])
     mean = np.zeros((n_trials, parts))
     mean[:, -2] = _starting_level(y)
-    both, values = phi[:, :, None] * phi[:, None], np.empty((n_trials, len(y)))
+    values = np.empty((n_trials, len(y)))
     for k, value in enumerate(y):
+        phi, both, steps = moves[spacing.before(k)]
         mean, p = phi * mean, both * p
         p[:, diagonal, diagonal] += steps
         shared = p.sum(-1)
@@ -119,7 +152,9 @@ def gaussian_values(y: Array, background: Background, sd: Array, tau: Array) -> 
     return values
 
 
-def switching_values(y: Array, background: Background, half: Array, up: Array, down: Array, n_paths: int) -> Array:
+def switching_values(
+    y: Array, background: Background, half: Array, up: Array, down: Array, n_paths: int, spacing: Spacing = CLOSE
+) -> Array:
     """Log likelihoods of two levels in the background, `(trial, block)`.
 
     Args:
@@ -129,21 +164,33 @@ def switching_values(y: Array, background: Background, half: Array, up: Array, d
         up: Mean dwell in the upper one, blocks, `(trial,)`.
         down: Mean dwell in the lower one, likewise.
         n_paths: Number of paths that are followed.
+        spacing: Where the block means lie.
     """
-    gains, s = _filter(background, len(y))
+    gains, s = _filter(background, len(y), spacing)
     uniform = np.random.default_rng(0).random(len(y))  # the same for all trials, so that their values compare
     n_trials, n_parts = len(half), len(background.phi)
     # From one block's end to the next one's: who goes and comes back in between has not moved.
     rate = 1 / up + 1 / down
-    leave, enter = (-np.expm1(-rate) / rate / up)[:, None], (-np.expm1(-rate) / rate / down)[:, None]
+
+    def switched(blocks: float) -> tuple[Array, Array]:
+        """Probabilities `(trial, 1)` of another level some blocks later, of the upper and of the lower one."""
+        share = -np.expm1(-rate * blocks) / rate
+        return (share / up)[:, None], (share / down)[:, None]
+
+    leave, enter = switched(1.0)
     upper = np.tile([False, True], (n_trials, 1))
     weight = np.concatenate([leave, enter], 1) / (leave + enter)
     mean = np.zeros((n_trials, 2, n_parts))
     mean[..., -1] = _starting_level(y)
     values = np.empty((n_trials, len(y)))
     for k, value in enumerate(y):
+        if (blocks := spacing.before(k)) > 1:  # the level may have moved where nobody looked
+            out, back = switched(blocks - 1)
+            unseen = weight * np.where(upper, out, back)
+            weight, upper = np.concatenate([weight - unseen, unseen], 1), np.concatenate([upper, ~upper], 1)
+            mean = np.concatenate([mean, mean], 1)
         n_before = upper.shape[1]
-        mean = mean * background.phi
+        mean = mean * background.phi**blocks
         e = value - mean.sum(-1)
         level = np.where(upper, half[:, None], -half[:, None])
         moved = weight * np.where(upper, leave, enter)
@@ -166,12 +213,14 @@ def switching_values(y: Array, background: Background, half: Array, up: Array, d
     return values
 
 
-def _filter(background: Background, n: int) -> tuple[Array, Array]:
+def _filter(background: Background, n: int, spacing: Spacing = CLOSE) -> tuple[Array, Array]:
     """Gains `(block, part)` of Kalman's filter and variances of its errors, `(block,)`: the same for all paths."""
     gains, variances = np.empty((n, len(background.phi))), np.empty(n)
     p, both = np.diag(background.start), background.phi[:, None] * background.phi
+    moves = {blocks: (both**blocks, np.diag(background.steps_over(blocks))) for blocks in {1.0, spacing.gap}}
     for k in range(n):
-        p = both * p + np.diag(background.steps)
+        kept, step = moves[spacing.before(k)]
+        p = kept * p + step
         shared = p.sum(-1)
         variances[k] = shared.sum() + background.white
         gains[k] = shared / variances[k]

@@ -8,19 +8,28 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.likelihoods.telegraph import Array, Background, backgrounds, gaussian_values, switching_values
+from gyrofuse.mismatch.likelihoods.telegraph import (
+    Array,
+    Background,
+    Spacing,
+    backgrounds,
+    gaussian_values,
+    switching_values,
+)
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED, in_fold
 from gyrofuse.noise.processes import AR1
 
 _SEARCHING, _FINAL = 48, 192  # paths that are followed: of each trial, and of the values that are compared
+_MOST_BLOCKS = 2048  # of one sensor
 _FEWEST_BLOCKS = 2.0  # blocks in a time constant, at least: longer ones average the levels away
 _STENCIL = (0.15, 0.35)  # half widths of a stencil in log half step and log dwells, halved where likelihoods are steep
 _NEAR = 3.0  # nats below the largest value, over which a likelihood is a parabola
@@ -56,23 +65,37 @@ class Means(NamedTuple):
         background: Noise in which two levels would stand.
         plain: Log likelihood of that alone, `(judged,)`.
         block: Samples in one.
+        spacing: Where they lie.
     """
 
     y: Array
     background: Background
     plain: Array
     block: int
+    spacing: Spacing
 
     @classmethod
     def of(cls, comparison: Comparison, sensor: int, tau: float) -> Means | None:
-        """Means over 2.5 blocks in a time constant in samples, at most 2048; `None` where these would be too long."""
-        block = max(2 ** max(math.floor(math.log2(tau / 2.5)), 0), comparison.n_samples // 2048)
+        """Means over 2.5 blocks in a time constant in samples; `None` where a sample is too long for that.
+
+        Of the judged parts of a long record the beginnings, as many blocks as there may be.
+        """
+        block = 2 ** max(math.floor(math.log2(tau / 2.5)), 0)
         if tau < _FEWEST_BLOCKS * block:
             return None
-        n = comparison.n_samples // N_JUDGED // block * N_JUDGED * block
-        y = _beside_channels(comparison, comparison.recording[sensor, :n].unflatten(-1, (-1, block)).mean(-1)).numpy()
+        part = comparison.n_samples // N_JUDGED  # samples
+        run = min(part // block, _MOST_BLOCKS // N_JUDGED)
+        apart = part if part // block > run else run * block
+        spacing = Spacing(run, 1 + apart / block - run)
+
+        def means_of(signal: Tensor) -> Tensor:
+            """Block means `(..., block)` of a signal `(..., time)`."""
+            parts = signal[..., : N_JUDGED * apart].unflatten(-1, (N_JUDGED, apart))
+            return parts[..., : run * block].unflatten(-1, (run, block)).mean(-1).flatten(-2)
+
+        y = _beside_channels(comparison, means_of(comparison.recording[sensor]), means_of).numpy()
         background = backgrounds(comparison.base, block)[sensor]
-        return cls(y, background, _noise_alone(y, background), block)
+        return cls(y, background, _noise_alone(y, background, spacing), block, spacing)
 
     def switching(self, theta: Array, n_paths: int) -> Array:
         """Log likelihood ratios of two levels to the noise alone, `(trial, judged)`.
@@ -82,12 +105,12 @@ class Means(NamedTuple):
             n_paths: Number of paths that are followed.
         """
         half, up, down = np.exp(theta.T)
-        return _judged(switching_values(self.y, self.background, half, up, down, n_paths)) - self.plain
+        return _judged(switching_values(self.y, self.background, half, up, down, n_paths, self.spacing)) - self.plain
 
     def gaussian(self, theta: Array) -> Array:
         """Log likelihood ratios of a Gaussian process, likewise, of logarithms of sd and time constant in blocks."""
         sd, tau = np.exp(theta.T)
-        return _judged(gaussian_values(self.y, self.background, sd, tau)) - self.plain
+        return _judged(gaussian_values(self.y, self.background, sd, tau, self.spacing)) - self.plain
 
     def numbers(self, theta: Array) -> Numbers:
         """Half step and dwells from their logarithms."""
@@ -95,14 +118,13 @@ class Means(NamedTuple):
         return Numbers(half, up * self.block, down * self.block)
 
 
-def _beside_channels(comparison: Comparison, means: Tensor) -> Tensor:
+def _beside_channels(comparison: Comparison, means: Tensor, means_of: Callable[[Tensor], Tensor]) -> Tensor:
     """Block means `(block,)` without a line on those of the channels: a course that follows one is no jump."""
-    most, n = 8, len(means)  # rows
+    most = 8  # rows
     rows = [v.to(torch.float64).reshape(-1, v.shape[-1]) for v in comparison.info.channels.values()]
-    block = comparison.n_samples // N_JUDGED * N_JUDGED // n
-    if not rows or sum(map(len, rows)) > most or min(v.shape[-1] for v in rows) < n * block:
+    if not rows or sum(map(len, rows)) > most or min(v.shape[-1] for v in rows) < comparison.n_samples:
         return means
-    courses = torch.cat(rows)[:, : n * block].unflatten(-1, (n, block)).mean(-1)
+    courses = means_of(torch.cat(rows)[:, : comparison.n_samples])
     courses = courses - courses.mean(-1, keepdim=True)
     if not bool(courses.isfinite().all()):
         return means
@@ -250,7 +272,7 @@ def _fitted(comparison: Comparison, sensor: int, sd: float, tau: float) -> TwoLe
     start, rival = _best_gaussian(means, np.log([sd, tau / means.block]))
     # Noise of another shape, such as flicker, is no Lorentzian: a Gaussian process with the recording's own spectrum.
     own = backgrounds(comparison.observed.base, means.block, 8)[sensor]
-    rival = max(rival, _noise_alone(means.y, own) - means.plain, key=np.sum)
+    rival = max(rival, _noise_alone(means.y, own, means.spacing) - means.plain, key=np.sum)
     trials = np.concatenate([_first_trials(*np.exp(start)), _apart(means.y)])
     values = means.switching(trials, _SEARCHING)
     for (size, times), least in (((0.25, 0.6), -5.0), (_STENCIL, 0.0)):
@@ -341,9 +363,9 @@ def vertex(trials: Array, value: Array) -> tuple[Array, Array]:
     return top + np.clip(step, [-0.25, -0.6, -0.6], [0.25, 0.6, 0.6]), axes @ np.diag(1 / eigen) @ axes.T
 
 
-def _noise_alone(y: Array, background: Background) -> Array:
+def _noise_alone(y: Array, background: Background, spacing: Spacing) -> Array:
     """Log likelihoods of the background alone, `(judged,)`."""
-    return _judged(gaussian_values(y, background, np.zeros(1), np.ones(1)))[0]
+    return _judged(gaussian_values(y, background, np.zeros(1), np.ones(1), spacing))[0]
 
 
 def _judged(values: Array) -> Array:
