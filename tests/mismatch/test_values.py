@@ -313,6 +313,20 @@ def test_a_sensor_that_hangs_repeats_samples_and_is_no_quiet_noise(step: float, 
     assert int((same[1:] & ~same[:-1]).sum()) == pytest.approx(int(same.sum()) / length, rel=0.35)
 
 
+@pytest.mark.parametrize(("period", "length"), [(120, 10), (193, 16), (60, 5)])
+def test_a_sensor_that_hangs_for_short_is_not_taken_for_coarse_values(period: int, length: int) -> None:
+    """Within a row a sample equals later ones as often as the next one, as on a coarse lattice."""
+    recording, simulation, _ = drawn(810, records=2)
+    place = torch.arange(N)
+    source = place - (place % period - (period - length)).clamp(min=0)
+    recording[1] = recording[1, source]
+    found = nominated(Comparison.of(SCENE, recording, simulation), StuckSamples)
+    assert found.sensors == (1,)
+    assert isinstance(found.effect, StuckSamples)
+    assert found.effect.row[1] == pytest.approx(length - 1, rel=0.05)
+    assert float(found.effect.probability[1]) == pytest.approx((length - 1) / period, rel=0.05)
+
+
 def test_what_is_read_twice_repeats_every_second_sample() -> None:
     recording, simulation, g = drawn(90, records=2)
     recording[:, 1::2] = recording[:, 0::2]

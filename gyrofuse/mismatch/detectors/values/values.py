@@ -120,12 +120,15 @@ def _met_as_often_later(signal: Tensor, share: Tensor, expected: Tensor, longest
     """Whether samples `(sensor, record, time)` equal later ones about as often as the next one, `(sensor,)`.
 
     Values are coarser then, by whatever lattice; a sample that is read twice is no more like the one after next. Rows
-    far longer than those of chance are those of a sensor that hangs.
+    far longer than those of chance are those of a sensor that hangs: within a row as many count as chance has there.
     """
     lags, beyond_chance = torch.arange(3, 7), 4.0
-    later = torch.stack(
-        [(signal[..., lag:] == signal[..., :-lag]).to(torch.float64).mean((1, 2)) for lag in lags.tolist()]
-    ).mean(0)
+    so_far, found = repeats_so_far(repeated(signal)), []
+    for lag in lags.tolist():
+        meets, row = signal[..., lag:] == signal[..., :-lag], so_far[..., lag:] >= lag
+        across, within = ((meets & part).to(torch.float64).mean((1, 2)) for part in (~row, row))
+        found.append(across + within.minimum(share**lag))
+    later = torch.stack(found).mean(0)
     excess = (share - expected).clamp(min=0)
     twice = excess.pow(lags[:, None]).mean(0)  # of samples that repeat one by one
     by_chance = math.log(1e3 * signal[0].numel()) / -share.clamp(1e-12, 1 - 1e-12).log()
