@@ -19,6 +19,7 @@ import math
 from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -155,7 +156,8 @@ def _scan(nuisance: Nuisance, comparison: Comparison) -> Scan:
     up, down = (nuisance.gains(sign * shapes.log_factors) for sign in (1, -1))
     signs = torch.stack([up, down, torch.logaddexp(up, down) - math.log(2)])  # (sign, shape, sensor)
     log_ratios = e_values_by_share(signs.movedim(-1, 0)) + shapes.log_prior  # (share, sign, shape)
-    share, sign, shape = (int(i) for i in torch.unravel_index(log_ratios.argmax(), log_ratios.shape))
+    # torch.unravel_index would load sympy, a second and a half.
+    share, sign, shape = (int(i) for i in np.unravel_index(int(log_ratios.argmax()), log_ratios.shape))
     own = torch.maximum(up, down)[shape] if sign == 2 else signs[sign, shape]
     sensors = tuple(int(i) for i in (own > math.log(1 / SHARES[share] - 1)).nonzero()[:, 0]) or (int(own.argmax()),)
     which = list(sensors)

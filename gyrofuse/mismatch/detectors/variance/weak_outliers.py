@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -71,7 +72,7 @@ def weak_outliers(z: Tensor) -> WeakOutliers:
     if joint.numel():
         together = log_mean(joint)
     if together > total:
-        size, rate, which = (int(k) for k in torch.unravel_index(joint.argmax(), joint.shape))
+        size, rate, which = (int(k) for k in np.unravel_index(int(joint.argmax()), joint.shape))
         group, members = [(g, s) for g, sets in zip(groups, several, strict=True) for s in sets][which]
         sensors = torch.zeros(n_sensors, dtype=torch.float64)
         sensors[group] = torch.tensor([float(members >> i & 1) for i in range(len(group))], dtype=torch.float64)
