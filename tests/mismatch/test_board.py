@@ -99,6 +99,7 @@ def test_one_cause_is_one_finding_in_nearly_all_boards(draws: Callable[[int, int
     assert single >= at_least(each * len(KINDS), 0.95)
 
 
+@pytest.mark.slow
 def test_two_causes_are_two():
     """A tone of the rates and another of the accelerations, and a step a while after that of the other group."""
     recordings, simulated = scene("", 3)
@@ -120,6 +121,7 @@ def test_a_board_that_agrees_has_no_cause():
     assert str(report).startswith("All 2 groups agree with the simulation (p = ")
 
 
+@pytest.mark.slow
 def test_sensitivity_to_acceleration_is_a_matrix():
     """Gyros of one device that follow three accelerations: nine gains, told as rows of a matrix."""
     g = torch.Generator().manual_seed(5)
@@ -168,6 +170,7 @@ def written(folder: Path, kind: str, seed: int) -> dict[str, Any]:
     return simulated
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank_images")
 def test_from_the_command_line(tmp_path: Path, run: Run):
     written(tmp_path, "step", 7)

@@ -69,6 +69,7 @@ def test_a_tone_that_follows_a_command_is_one_finding_with_its_law():
     assert report.held_out.before > 8 > 1.5 > report.held_out.after
 
 
+@pytest.mark.slow
 def test_the_repaired_simulation_follows_the_channel_of_another_recording():
     u, other = throttle(2), throttle(3)
     one, simulation = sides(2, tone(40 + 200 * u, SIZE), u)
@@ -84,6 +85,7 @@ def test_the_repaired_simulation_follows_the_channel_of_another_recording():
         report.model.simulate(N, channels={"throttle": other[:100]})
 
 
+@pytest.mark.slow
 def test_two_motors_and_a_harmonic_are_told_apart():
     g = torch.Generator().manual_seed(4)
     command = (0.5 + 0.08 * wandering(g, 3.0) + 0.03 * wandering(g, 0.5, 2)).clamp(0.1, 1.0)
@@ -97,6 +99,7 @@ def test_two_motors_and_a_harmonic_are_told_apart():
     assert found.sentence.startswith("3 tones whose frequencies follow throttle, row ")
 
 
+@pytest.mark.slow
 def test_what_turns_comes_late():
     u, late_s = throttle(5), 0.06
     keeps = math.exp(-1 / (late_s * RATE))
@@ -118,6 +121,7 @@ def test_a_law_that_bends_is_fitted():
     assert line.rise == pytest.approx(90 / math.sqrt(middle), rel=0.05)
 
 
+@pytest.mark.slow
 def test_values_that_a_slower_source_sent_lie_on_straight_lines():
     u, held = throttle(7), 20  # samples
     sent = u[::held].repeat_interleave(held)[:N]
@@ -143,6 +147,7 @@ def test_of_a_long_record_the_stretch_counts_in_which_the_channel_moves():
     assert busiest([still], 1000) == slice(0, 1000)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["nothing", "wandering tone", "steady tone", "sag", "louder"])
 def test_what_does_not_follow_the_channel_is_none(what: str):
     u = throttle(10)

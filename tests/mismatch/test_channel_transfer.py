@@ -90,6 +90,7 @@ def test_a_diagnosis_names_them_and_the_repair_follows_another_motion():
         report.model.simulate(N, channels={"acceleration": motion(11)[:, :100]}, generator=generator(6))
 
 
+@pytest.mark.slow
 def test_one_gain_at_all_frequencies_has_a_name_of_its_own():
     taps = torch.zeros(P, 3, 1, dtype=torch.float64)
     taps[0, 0] = taps[2, 1] = 0.1

@@ -150,6 +150,7 @@ def test_other_units_are_a_finding():
     assert not report.unexplained
 
 
+@pytest.mark.slow
 def test_the_discrepancy_is_that_of_a_diagnosis():
     two = [0, 1]
     recording, simulation = array(5, N // 2).select(sensors=two), array(6, N).select(sensors=two)
@@ -333,6 +334,7 @@ def model_on_device(model: gf.Model) -> gf.Model:
     return model.with_params(model.params.cuda(), estimated_from=model.estimated_from)
 
 
+@pytest.mark.slow
 def test_what_leads_away_is_searched_without(monkeypatch: pytest.MonkeyPatch):
     """Once: what was found in its place may have been hidden behind it."""
     module = sys.modules[diagnose.__module__]

@@ -47,6 +47,7 @@ def test_a_high_pass_has_its_corner_and_its_sensors(design: np.ndarray, corner: 
     assert not [u for u in report.unexplained if u.test == "slow"]  # of the sensor whose walk is as simulated
 
 
+@pytest.mark.slow
 def test_a_band_stop_of_high_order_is_a_notch() -> None:
     design = signal.butter(4, [15.0, 25.0], "bandstop", fs=RATE, output="sos")
     report = diagnosed(filtered(noise(3), [1], design), noise(4))
@@ -57,6 +58,7 @@ def test_a_band_stop_of_high_order_is_a_notch() -> None:
     assert report.held_out.after < 1.5
 
 
+@pytest.mark.slow
 def test_a_band_pass_is_a_low_pass_and_a_high_pass() -> None:
     design = signal.butter(3, [4.0, 22.0], "bandpass", fs=RATE, output="sos")
     recording, simulation = (noise(seed, n=30_000) for seed in (5, 6))
@@ -65,6 +67,7 @@ def test_a_band_pass_is_a_low_pass_and_a_high_pass() -> None:
     assert report.held_out.after < 1.5
 
 
+@pytest.mark.slow
 def test_what_a_filter_leaves_of_heavy_tails_lacks_no_outliers() -> None:
     design = signal.butter(2, [12.0, 20.0], "bandstop", fs=RATE, output="sos")
     report = diagnosed(filtered(noise(7, "laplace"), [0, 1, 2], design), noise(8, "laplace"))
@@ -88,6 +91,7 @@ def test_tones_may_all_be_twice_as_fast() -> None:
     assert finding.parameters["ratio"].value == pytest.approx(2, abs=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("times", [4.0, 2.5])
 def test_a_sensor_slower_than_its_log_has_its_rate(times: float) -> None:
     fast = noise(13)

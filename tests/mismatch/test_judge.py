@@ -49,6 +49,7 @@ def test_a_repair_that_holds_helps_there_too():
     assert told["classifier"] == {"before": j.auc_before, "after": j.auc_after, "repeatability": j.auc_repeatability}
 
 
+@pytest.mark.slow
 def test_shares_say_what_carries_the_discrepancy():
     """Each from where the one before it ends, on the judge and on blocks held out alike; what is left is the rest."""
     loud = gf.ArrayModel.from_sensors([gf.WhiteNoise(2.0) + gf.AR1(0.98, 1e-3) for _ in range(2)])
@@ -80,6 +81,7 @@ def test_what_does_next_to_nothing_carries_nothing():
     assert abs(j.shares[1].share) < 1e-4
 
 
+@pytest.mark.slow
 def test_a_repair_of_what_was_there_once_does_not():
     """A tone in the recording alone: the device does not have it elsewhere, and does not repeat itself either."""
     report = gf.diagnose(recording(drawn(1) + tone()), NOISE, judge=recording(drawn(2)))
@@ -110,6 +112,7 @@ def test_the_discrepancy_before_is_that_of_the_simulation():
     assert j.repeatability == pytest.approx(gf.mismatch.discrepancy(judge, recording(drawn(1))), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_what_follows_a_channel_that_the_judge_lacks_is_left_out():
     shake = torch.randn(3, N, generator=torch.Generator().manual_seed(7), dtype=torch.float64) + torch.eye(3)[2:].mT
     moved = recording(drawn(1) + 0.3 * shake[:1] + tone(), acceleration=shake)
@@ -146,6 +149,7 @@ def test_refuses_what_is_no_recording_of_the_same_device(judge: Any, error: type
         gf.diagnose(recording(drawn(1), heat=torch.zeros(N)), NOISE, judge=judge)
 
 
+@pytest.mark.slow
 def test_from_the_command_line(run: Run, tmp_path: Path):
     recording(drawn(1) + tone()).save(tmp_path / "log.npz")
     gapped = drawn(2, 6007) + tone(6007, 1.0)

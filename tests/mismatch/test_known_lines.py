@@ -111,6 +111,7 @@ def test_a_tone_at_another_frequency_is_named_and_the_missing_one_told():
     assert report.unexplained == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sampled", [False, True])
 def test_a_tone_that_is_nearly_where_it_was_shows_another_clock_or_frequency(sampled: bool):
     """A phase that slips by less than a cycle: no other amplitude, and limits hold the factor of the frequencies."""
@@ -144,6 +145,7 @@ def test_another_size_is_a_number_that_was_wrong(sampled: bool, factor: float):
     assert not again.mismatch
 
 
+@pytest.mark.slow
 def test_only_the_sensor_whose_tone_is_another_is_named():
     signal = observed(toned(), 7).signal
     others = observed(toned(0.03), 7).signal

@@ -56,6 +56,7 @@ def test_white_noise_that_is_left_out():
     assert report.unexplained == ()
 
 
+@pytest.mark.slow
 def test_a_filter_that_is_found_later_leaves_a_tone_as_it_is():
     """Its amplitude is that of the recording, whatever other numbers make of the noise."""
     tone = gf.Sinusoid(0.05, 0.34)
@@ -88,6 +89,7 @@ def test_fast_noise_is_described_whatever_the_length(n: int):
     assert float((base.spectrum(f)[0] / truth.spectrum(f) - 1).abs().max()) < 0.06
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("order", "corner"), [(1, 0.3), (2, 0.25)])
 def test_an_ar1_that_stands_for_a_filter_is_told(order: int, corner: float):
     """Of a filtered gyroscope a model of white noise, an AR1 and a walk is fitted; a resonance would mend its form."""
@@ -110,6 +112,7 @@ def test_an_ar1_that_stands_for_a_filter_is_told(order: int, corner: float):
     assert report.judged.after < report.judged.before / 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [0.8, pytest.param(0.5, marks=pytest.mark.statistical)])
 def test_a_fit_without_the_quantisation_of_an_angle(size: float):
     """What is left out has made the white noise that was fitted too loud: both are told, and explain all."""

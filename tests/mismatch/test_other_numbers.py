@@ -46,6 +46,7 @@ def holds(finding: Finding, name: str, truth: float, slack: float = 0.0) -> bool
     return entry.low * (1 - slack) <= truth <= entry.high * (1 + slack)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("order", "corner", "step"), [(1, 30.0, 0.05), (2, 22.0, 0.06)])
 def test_a_filter_in_front_of_the_converter_has_its_own_corner(order: int, corner: float, step: float) -> None:
     report = diagnosed(rounded(low_passed(noise(1), order, corner), step), rounded(noise(2), step))
@@ -56,6 +57,7 @@ def test_a_filter_in_front_of_the_converter_has_its_own_corner(order: int, corne
     assert not report.unexplained
 
 
+@pytest.mark.slow
 def test_a_filter_is_told_though_its_noise_is_smaller_than_a_step() -> None:
     report = diagnosed(rounded(low_passed(noise(3), 1, 20.0), 0.1), noise(4))
     assert sorted(f.mechanism for f in report.findings) == ["low_pass", "quantization"]
@@ -64,6 +66,7 @@ def test_a_filter_is_told_though_its_noise_is_smaller_than_a_step() -> None:
     assert report.held_out.after < 1.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("orders", "corners", "step"),
     [((2, 2), (40.0, 30.0), 0.0), ((3, 1), (25.0, 40.0), 0.0), ((1, 1), (50.0, 32.0), 0.05)],
@@ -81,6 +84,7 @@ def test_a_filter_of_another_corner_than_the_simulations(
     assert report.held_out.after < 1.5
 
 
+@pytest.mark.slow
 def test_a_filter_of_another_corner_beside_a_sensor_without_one() -> None:
     """The sensor without says nothing of the simulation's filter."""
     sides = [noise(105 + k) for k in (0, 1)]
@@ -92,6 +96,7 @@ def test_a_filter_of_another_corner_beside_a_sensor_without_one() -> None:
     assert holds(finding, "simulated_corner", 25.0, 0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("recorded", "simulated"),
     [
@@ -173,6 +178,7 @@ def steady_noise(seed: int) -> np.ndarray:
     return 0.1 * rng.standard_normal((3, N)) + walk
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rounds", [False, True])
 def test_a_converter_that_drops_the_fraction_is_told_from_one_that_rounds(rounds: bool) -> None:
     simulation = steady_noise(32)

@@ -236,6 +236,7 @@ def test_a_line_that_moves_is_seen_with_either_sign() -> None:
     assert sweeps.chirp_test(both).p_value > 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("amplitude", [0.3, 1.0])
 def test_a_strong_sweep_is_no_resonance(amplitude: float, monkeypatch: pytest.MonkeyPatch) -> None:
     recording, simulation, _ = drawn(21)
@@ -281,6 +282,7 @@ def test_a_bias_that_depends_on_the_way_is_seen() -> None:
     assert hysteresis.hysteresis_test(Comparison.of(info(), recording, simulation)).p_value == 1.0
 
 
+@pytest.mark.slow
 def test_a_loop_of_all_sensors_is_no_noise_in_common() -> None:
     recording, simulation, _ = drawn(31)
     t = torch.arange(N, dtype=torch.float64) / N

@@ -192,7 +192,11 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+QUICK = ("rotor", "thermostat", "handled", "converters in turns", "switches", "shocks")
+EACH = [pytest.param(case, id=name, marks=() if name in QUICK else pytest.mark.slow) for name, case in CASES.items()]
+
+
+@pytest.mark.parametrize("case", EACH)
 def test_it_is_named_and_nothing_else_is(case: Case) -> None:
     report = diagnosed(case.recording(1))
     assert sorted(f.mechanism for f in report.findings) == sorted(case.names)
@@ -204,6 +208,7 @@ def test_it_is_named_and_nothing_else_is(case: Case) -> None:
         assert abs(value - middle) < 1.7 * half, name  # of several limits of 95 %
 
 
+@pytest.mark.slow
 def test_a_filter_of_the_simulation_alone_is_told_as_such() -> None:
     design = signal.butter(2, 40.0, fs=RATE, output="sos")
     report = diagnosed(noise(1)[:, 200:], signal.sosfilt(design, noise(2))[:, 200:])
@@ -236,6 +241,7 @@ def ringing(seed: int, frequency: float, sd: float) -> np.ndarray:
     return sd * x / x.std()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 3])
 def test_a_resonance_of_the_simulation_alone_is_told_as_such(seed: int) -> None:
     report = diagnosed(noise(seed), noise(seed + 1) + ringing(seed, 30.0, 0.6))
@@ -246,6 +252,7 @@ def test_a_resonance_of_the_simulation_alone_is_told_as_such(seed: int) -> None:
     assert finding.parameters["rms[1]"].value == pytest.approx(0.6, rel=0.2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 5])
 def test_a_resonance_at_another_frequency_is_told_with_both(seed: int) -> None:
     """What the one has at its foot stands for a part of the other: neither is found alone."""
@@ -257,6 +264,7 @@ def test_a_resonance_at_another_frequency_is_told_with_both(seed: int) -> None:
     assert finding.parameters["frequency"].value == pytest.approx(36, abs=0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [0.4, 20.0])
 def test_common_noise_of_the_simulation_alone_is_told_as_such(size: float) -> None:
     """Which is no gain of whole sensors, however much louder all of them are."""
@@ -290,6 +298,7 @@ def test_they_are_named_nearly_always(half: int, draws: Callable[[int, int], int
     assert right >= at_least(len(cases) * len(seeds), 0.95)
 
 
+@pytest.mark.slow
 def test_what_follows_a_motor_is_told_as_such() -> None:
     command = torch.from_numpy(np.repeat(np.random.default_rng(3).uniform(size=N // 512 + 1), 512)[:N])
     late = signal.lfilter([0.02], [1, -0.98], command.numpy())
@@ -306,6 +315,7 @@ def louder(seed: int, sd: np.ndarray) -> np.ndarray:
     return sd * white + slow
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["level", "size", "vibration"])
 def test_noise_as_loud_as_a_channel_says_names_the_channel(kind: str) -> None:
     rng = np.random.default_rng(5)
@@ -332,6 +342,7 @@ def test_noise_as_loud_as_a_channel_says_names_the_channel(kind: str) -> None:
     assert bool((within > 1.8 * without).all())
 
 
+@pytest.mark.slow
 def test_noise_that_is_louder_for_a_while_follows_no_channel() -> None:
     loud = np.where((T > 20) & (T < 50), 1.6, 1.0)
     command = torch.from_numpy(np.cumsum(np.random.default_rng(6).standard_normal((1, N)), -1))
@@ -339,6 +350,7 @@ def test_noise_that_is_louder_for_a_while_follows_no_channel() -> None:
     assert (found.mechanism, found.channel) == ("variance_change", None)
 
 
+@pytest.mark.slow
 def test_jumps_are_seen_beside_a_course_of_temperature() -> None:
     g = np.random.default_rng(3)
     temperature = 25 + 8 * np.sin(2 * math.pi * T / T[-1] / 0.7)
@@ -348,6 +360,7 @@ def test_jumps_are_seen_beside_a_course_of_temperature() -> None:
     assert {f.mechanism for f in report.findings} == {"temperature_drift", "random_telegraph"}
 
 
+@pytest.mark.slow
 def test_what_wanders_about_a_frequency_is_no_chirp() -> None:
     g = np.random.default_rng(4)
     f = 60 + signal.lfilter([math.sqrt(1 - 0.998**2)], [1, -0.998], g.standard_normal(N))
@@ -380,6 +393,7 @@ def test_errors_far_beyond_the_noise_are_outliers_and_no_noise() -> None:
     assert found.parameters["amplitude[1]"].low < 400 < found.parameters["amplitude[1]"].high
 
 
+@pytest.mark.slow
 def test_physics_is_complete_only_where_nothing_else_is_seen() -> None:
     complete = "The physics is complete, the numbers were wrong."
     assert complete in diagnosed(1.3 * noise(7)).summary()
@@ -387,6 +401,7 @@ def test_physics_is_complete_only_where_nothing_else_is_seen() -> None:
     assert complete not in diagnosed(at_random * noise(8)).summary()
 
 
+@pytest.mark.slow
 def test_noise_that_is_far_louder_for_a_while_is_no_other_unit() -> None:
     """Its power on average is that of 9.81 times the noise."""
     loud = np.where((T > 20) & (T < 45), 17.5, 1.0)
@@ -396,6 +411,7 @@ def test_noise_that_is_far_louder_for_a_while_is_no_other_unit() -> None:
     assert "m/s^2 against g" in found.sentence
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("half_width", [0.5, 2.0])
 def test_a_dead_band_of_nearly_all_values_is_one(half_width: float) -> None:
     """Of 2 sd 95 % of the values are zero, which a sensor that hangs would hold as well."""
@@ -406,6 +422,7 @@ def test_a_dead_band_of_nearly_all_values_is_one(half_width: float) -> None:
     assert findings[0].parameters["dead_band[0]"].value == pytest.approx(half_width, rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_pulse_in_quiet_times_is_none_beside_a_tone_in_spells() -> None:
     x = noise(44) + 6.0 * np.cos(2 * math.pi * 71.3 * T) * ((T > 20) & (T < 45))
     findings = diagnosed(x).findings

@@ -132,6 +132,7 @@ def test_nothing_remains_where_nothing_differs():
     assert float(Remainder.left_over(comparison(white(1)[0])).log_gain.abs().mean()) < 0.03
 
 
+@pytest.mark.slow
 def test_a_difference_without_a_name_stays_unexplained_and_is_filled_in():
     g, n = generator(5), 2**14
     base = gf.WhiteNoise(1.0) + gf.RandomWalk(1e-8)

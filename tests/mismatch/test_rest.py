@@ -25,6 +25,7 @@ def moved(seed: int, *stretches: tuple[int, int], gyros: bool = True) -> tuple[T
     return gyro, acceleration
 
 
+@pytest.mark.slow
 def test_a_start_and_an_end_that_move_are_told():
     gyro, acceleration = moved(1, (0, 410), (7700, N))
     rest = stretch_at_rest(gyro, acceleration, normal(3, N, g=torch.Generator().manual_seed(2)))

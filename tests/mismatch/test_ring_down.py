@@ -75,6 +75,7 @@ def test_noise_of_both_that_is_heavy_tailed_or_wanders_rings_no_more_often(kind:
     assert min(p_values) > 1e-4
 
 
+@pytest.mark.slow
 def test_a_line_that_wanders_and_comes_and_goes_is_no_knock_and_hides_none():
     n, n_runs, alarms = 65536, 8, 0
     t, steadiness = torch.arange(n, dtype=torch.float64), math.exp(-1 / 500)
@@ -162,6 +163,7 @@ def test_a_mode_that_is_struck_again_before_it_has_died_away_is_two_knocks_of_on
     assert (found.effect.frequency_hz / RATE).tolist() == pytest.approx([0.384, 0.384], abs=2e-4)
 
 
+@pytest.mark.slow
 def test_many_knocks_of_one_mode_are_each_found():
     """Seen from afar they are a line that comes and goes."""
     g = generator(9)
@@ -203,7 +205,12 @@ def others(kind: str, g: torch.Generator) -> Tensor:
     return of_nats(torch.sin(2 * math.pi * (0.2 * t + (0.01 * steps).cumsum(-1))), 2000.0)
 
 
-@pytest.mark.parametrize("kind", ["spike", "step", "louder", "tone", "swelling", "wandering tone"])
+LIKE_ONE = ("step", "spike", "louder", "tone", "swelling", "wandering tone")
+
+
+@pytest.mark.parametrize(
+    "kind", [*LIKE_ONE[:1], *(pytest.param(kind, marks=pytest.mark.slow) for kind in LIKE_ONE[1:])]
+)
 def test_what_looks_like_one_has_another_name(kind: str):
     for seed in range(2):
         g = generator(seed)

@@ -60,6 +60,7 @@ def test_what_was_rounded_had_the_variance_and_the_correlation_of_the_noise(step
             assert before - wanted == pytest.approx(step**2 / 12, rel=0.3)
 
 
+@pytest.mark.slow
 def test_what_is_built_into_rounded_samples_is_rounded_as_they_are() -> None:
     g = generator(2)
     t = torch.arange(N) / RATE
@@ -83,6 +84,7 @@ def test_what_is_built_into_rounded_samples_is_rounded_as_they_are() -> None:
     assert float((change * weak).sum() / weak.square().sum()) == pytest.approx(1.0, abs=0.35)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_a_hump_that_the_simulation_has_elsewhere_is_not_doubled(seed: int) -> None:
     g = generator(seed)
@@ -94,6 +96,7 @@ def test_a_hump_that_the_simulation_has_elsewhere_is_not_doubled(seed: int) -> N
     assert report.held_out.after < 1.2 * max(report.held_out.before, 1.0)
 
 
+@pytest.mark.slow
 def test_a_hump_is_not_doubled_after_another_repair() -> None:
     """What an earlier finding mended is no room for a later one that leads away."""
     g = generator(0)
@@ -107,6 +110,7 @@ def test_a_hump_is_not_doubled_after_another_repair() -> None:
     assert report.held_out.after < 2
 
 
+@pytest.mark.slow
 def test_lines_that_both_have_do_not_speak_against_other_levels() -> None:
     g = generator(3)
     line = 4 * torch.cos(0.9 * torch.arange(4 * N))
@@ -165,6 +169,7 @@ def test_a_recording_that_something_was_taken_off_has_the_lattice_of_its_simulat
     assert Quantization.detect_and_fit(Comparison.of(SCENE, given, simulation), 1e-3) is not None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("finer", [0.0, 0.2], ids=["no step", "finer steps"])
 def test_rounding_that_only_the_simulation_has_is_told_and_goes(finer: float) -> None:
     g = generator(21)

@@ -29,6 +29,7 @@ def mixed(seed: int, share: float, ratio: float, n: int = N) -> Tensor:
     return white + torch.from_numpy(dsp.lfilter([1.0], [1.0, -0.99], steps.numpy())[:, 2000:].copy())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("share", "ratio"), [(0.2, 3.0), (0.5, 6.0)])
 def test_two_levels_are_named_with_their_numbers(share: float, ratio: float):
     report = gf.diagnose(mixed(1, share, ratio), NOISE, rate=100.0)
@@ -87,6 +88,7 @@ def test_the_law_is_the_likeliest():
                 assert float(torch.logaddexp(*other.log_densities(z)).sum()) <= best + 1e-6
 
 
+@pytest.mark.slow
 def test_episodes_and_gaussian_noise_are_none():
     g = torch.Generator().manual_seed(8)
     quiet = NOISE.simulate(N, generator=g)

@@ -75,6 +75,7 @@ def test_it_is_the_one_cause_and_gone_after_the_repair() -> None:
     assert told.held_out.after < 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("order", "corner"), [(1, 0.1), (1, 0.3), (2, 0.2), (4, 0.25)])
 def test_a_filter_of_one_that_is_moved_with_others_is_no_delay(order: int, corner: float) -> None:
     """It turns the phase of what they share as well, and no source in common does."""
@@ -88,6 +89,7 @@ def test_a_filter_of_one_that_is_moved_with_others_is_no_delay(order: int, corne
     assert told.held_out.after < 2
 
 
+@pytest.mark.slow
 def test_a_filter_is_told_where_what_moves_the_sensors_is_a_hump() -> None:
     """Which is in both, and none that stands out."""
 

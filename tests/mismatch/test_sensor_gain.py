@@ -65,6 +65,7 @@ def test_another_level_of_one_noise_is_no_gain(louder: str):
     assert SensorGain.detect_and_fit(compared(recording, simulation), 1e-3) is None
 
 
+@pytest.mark.slow
 def test_a_sensor_the_other_way_round_is_seen_by_the_motion():
     recording, simulation = sides(4)
     report = gf.diagnose(turned(recording, s3=-1.0), simulation, rate=RATE)
@@ -84,6 +85,7 @@ def test_a_sensor_the_other_way_round_is_seen_by_lines():
     assert report.held_out.after < 1.5
 
 
+@pytest.mark.slow
 def test_lines_whose_phases_mean_nothing_have_no_sign():
     """Each sensor's own are drawn by themselves: signs agree by chance as often as their p value says."""
     n_runs, level, passed = 200, 0.05, 0

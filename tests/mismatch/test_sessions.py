@@ -141,6 +141,7 @@ def test_the_page_says_whose_each_cause_is(tmp_path: Path):
     assert html.count('<section id="cause-') == n_causes
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank_images")
 def test_from_the_command_line(tmp_path: Path, run: Run):
     """Files that have all sensors of the simulation each are recordings; one device a file is one array."""
@@ -162,6 +163,7 @@ def test_from_the_command_line(tmp_path: Path, run: Run):
     assert "`--twins`: expected with a single recording, got 2" in refused.err
 
 
+@pytest.mark.slow
 def test_one_device_a_file_is_one_array_unless_it_is_said(tmp_path: Path, run: Run):
     for k, name in enumerate(("left", "right")):
         gf.Recording(recordings()[k].signal[:1], rate=RATE, unit="deg/s").save(tmp_path / f"{name}.npz")

@@ -59,6 +59,7 @@ def test_white_noise_of_which_sensors_share_a_part_is_named_though_no_power_chan
     assert common_source_test(explained).p_value > 1e-4
 
 
+@pytest.mark.slow
 def test_noise_of_one_sensor_alone_is_of_no_common_source_and_may_be_two_levels() -> None:
     noise, g = gf.WhiteNoise(1.0) + gf.AR1(0.999, 1e-4) + gf.RandomWalk(1e-8), generator(7)
     recording, simulation = (noise.simulate(N, batch=(P,), generator=g) for _ in range(2))
@@ -157,6 +158,7 @@ def test_less_white_noise_is_no_other_unit_though_it_has_most_bands():
     assert UnitScale.detect_and_fit(comparison(in_g, simulation), 1e-3) is not None
 
 
+@pytest.mark.slow
 def test_noise_that_falls_almost_as_flicker_noise_does_has_one_name():
     """Strong `1/f` noise that is a tenth weaker at the highest frequencies: whatever bends a spectrum would mend it."""
 
@@ -211,7 +213,12 @@ def test_signals_have_the_spectra_that_a_mechanism_promises(name: str):
     assert float((error.amax((-1, -2)) / spread)[high].max()) < 12.0
 
 
-@pytest.mark.parametrize("name", ["levels", "filter", "own modes", "one mode", "flicker", "white in common"])
+REFITTED = ("filter", "levels", "own modes", "one mode", "flicker", "white in common")
+
+
+@pytest.mark.parametrize(
+    "name", [*REFITTED[:1], *(pytest.param(name, marks=pytest.mark.slow) for name in REFITTED[1:])]
+)
 def test_numbers_without_a_fold_are_near_those_of_all(name: str):
     _, change, _ = CHANGES[name]
     given = drawn(17, change)
@@ -229,6 +236,7 @@ def test_nothing_is_named_where_nothing_is_missing():
     assert named == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("corner", [0.125, 0.3, 0.4])
 def test_a_strong_filter_of_one_sensor_of_three_is_named_with_its_form(corner: float):
     """Thousands of nats beside two sensors that differ in nothing; found nothing before."""
@@ -247,6 +255,7 @@ def test_a_strong_filter_of_one_sensor_of_three_is_named_with_its_form(corner: f
     assert abs(entry.value - RATE * corner) < 2.1 * (entry.high - entry.low) / 2
 
 
+@pytest.mark.slow
 def test_a_filter_of_another_form_is_named_and_said_to_differ():
     """A FIR filter under a Hamming window: no form of the catalogue."""
     g = generator(32)

@@ -502,6 +502,7 @@ def test_shapes_are_searched_once_for_a_case():
     assert leading_shape(given) is leading_shape(given)
 
 
+@pytest.mark.slow
 def test_what_a_shape_is_fitted_beside_comes_first_where_it_was_passed_over():
     given = drawn(22, lambda x, g: CHANGES["filter"][1](CHANGES["white in common"][1](x, g), g))
     first = leading_shape(given)

@@ -63,6 +63,7 @@ def test_each_sensor_may_lag_by_a_time_of_its_own() -> None:
     assert float((drift - truth).std(-1).max()) < 0.02
 
 
+@pytest.mark.slow
 def test_of_equals_the_cause_that_was_recorded_is_named() -> None:
     """A sine of one period is as good as the temperature that has it."""
     angle = 2 * math.pi * 3 * T / T[-1]
@@ -86,12 +87,14 @@ def test_a_heater_that_is_switched_on_is_one_cause(seed: int) -> None:
     assert found.effect.happened_once
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "course"), [("step", 1.0 * (T > 150)), ("ramp", np.clip(T - 150, 0, None) / 100)])
 def test_steps_and_ramps_stay_what_they_are(name: str, course: np.ndarray) -> None:
     found = diagnosed(noise(11) + np.array([[0.8], [-0.5], [0.4]]) * course).findings
     assert [f.mechanism for f in found] == [name]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("f", [3.1, 0.9])  # of the slow one 256 blocks would have a cycle each
 def test_a_scale_factor_that_follows_temperature_is_seen_in_what_moves_the_device(f: float) -> None:
     temperature = 25 + 15 * T / T[-1]

@@ -39,6 +39,7 @@ def report(recording: np.ndarray, simulation: np.ndarray) -> gf.MismatchReport:
     return gf.diagnose(*(gf.Recording(torch.from_numpy(x), rate=RATE, unit="deg/s") for x in (recording, simulation)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [208.0, 199.6])
 def test_the_rate_is_told_to_some_ppm(rate: float) -> None:
     lines = {31.0: 0.5, 52.7: 0.4}

@@ -41,6 +41,7 @@ def found_in(effect: Tensor, seed: int) -> gf.MismatchReport:
     return gf.diagnose(gf.Recording(signal, rate=RATE, unit="deg/s"), MODEL)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("nats", [3000.0, 100_000.0])
 @pytest.mark.parametrize("anew", [True, False])
 def test_all_spells_are_one_finding(nats: float, anew: bool):
@@ -78,6 +79,7 @@ def test_what_is_there_all_the_time_has_no_spells():
         assert ToneInSpells.detect_and_fit(comparison, 1e-3) is None
 
 
+@pytest.mark.slow
 def test_a_repaired_simulation_is_on_as_long_at_other_times():
     report = found_in(running(SPELLS, 30_000.0), 3)
     drawn = report.model.simulate(N, batch=(20,), generator=generator(4))

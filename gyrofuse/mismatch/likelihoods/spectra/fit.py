@@ -103,7 +103,7 @@ def fit(data: Ratios, terms: Sequence[Term], rounds: int = 40) -> Fit:
         precision = torch.cat([_precision(t) for t in terms])
         information, slope = _power_slopes(data, *(_diagonals(model, derivatives) if whole else (model, derivatives)))
         if paired:
-            beside = _wishart_slopes(*_correlated(model, derivatives), correlations(data.observed), data.pair_dof)
+            beside = _wishart_slopes(*_correlated(model, derivatives), data.correlation, data.pair_dof)
             information, slope = information + beside[0], slope + beside[1]
         slope = slope - precision * vector
         information = information + precision.diag()

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -99,25 +100,45 @@ class Ratios:
     def n_sensors(self) -> int:
         return self.observed.shape[-1]
 
-    @property
+    @cached_property
     def ratio(self) -> Tensor:
         """Ratios of powers, with the floor, `(band, sensor)`."""
         return floored(self.observed.diagonal(dim1=-2, dim2=-1).real)
 
-    @property
+    @cached_property
     def information(self) -> Tensor:
         """Information on a power in `log m`, `(band,)`."""
         return self.d * self.s / (self.d + self.s + 1)
 
-    @property
+    @cached_property
     def weight(self) -> Tensor:
         """Weight of a power, `(band, sensor)`: less than one where sensors share noise."""
         return self.usable / self.together
 
-    @property
+    @cached_property
     def independent(self) -> bool:
         """Whether the reference's sensors are independent, so that no filter changes a correlation."""
         return float((self.expected - torch.eye(self.n_sensors)).abs().max()) < 1e-9  # rounding
+
+    @cached_property
+    def odds(self) -> Tensor:
+        """Ratios of sums of powers in place of means, `(band, sensor)`."""
+        return self.d[:, None] * self.ratio / self.s.clamp(min=1e-300)[:, None]
+
+    @cached_property
+    def log_unchanged(self) -> Tensor:
+        """Log likelihood of powers without a difference, `(band, sensor)`, weights not counted."""
+        return (self.d + self.s.clamp(min=1e-300))[:, None] * self.odds.log1p()
+
+    @cached_property
+    def correlation(self) -> Tensor:
+        """Correlation matrices of the recording, `(band, sensor, sensor)`."""
+        return correlations(self.observed)
+
+    @cached_property
+    def log_correlated(self) -> Tensor:
+        """Log likelihood of the correlations without a difference, `(band,)`."""
+        return _wishart(self.expected, self.correlation, self.pair_dof)
 
     @property
     def n_ordinates(self) -> float:
@@ -141,10 +162,9 @@ def power_gains(data: Ratios, m: Tensor) -> Tensor:
         data: What is to be explained.
         m: Power over that of the reference, `(..., band, sensor)`.
     """
-    d, s, r = data.d[:, None], data.s.clamp(min=1e-300)[:, None], data.ratio
+    d, s = data.d[:, None], data.s.clamp(min=1e-300)[:, None]
     m = floored(m)
-    odds = d * r / s
-    return data.weight * ((d + s) * (odds.log1p() - (odds / m).log1p()) - d * m.log())
+    return data.weight * (data.log_unchanged - (d + s) * (data.odds / m).log1p() - d * m.log())
 
 
 def power_scores(data: Ratios, m: Tensor) -> Tensor:
@@ -158,9 +178,7 @@ def log_gain(data: Ratios, model: Tensor, *, paired: bool = True) -> Tensor:
     """Log likelihood of a model `(band, sensor, sensor)` over none, `(band,)`, nats."""
     gain = power_gains(data, model.diagonal(dim1=-2, dim2=-1).real).sum(-1)
     if paired and bool((data.pair_dof > 0).any()):
-        matrices = correlations(data.observed)
-        gain = gain + _wishart(correlations(model), matrices, data.pair_dof)
-        gain = gain - _wishart(data.expected, matrices, data.pair_dof)
+        gain = gain + _wishart(correlations(model), data.correlation, data.pair_dof) - data.log_correlated
     return gain
 
 
