@@ -63,6 +63,20 @@ def test_each_sensor_may_lag_by_a_time_of_its_own() -> None:
     assert float((drift - truth).std(-1).max()) < 0.02
 
 
+def test_a_bias_that_follows_the_rate_of_change_alone_is_named_where_the_record_begins_in_the_middle_of_it() -> None:
+    """The course is steepest at the start, and what a lag from equilibrium would make of that has another shape."""
+    courses = 10 * np.exp(-5 * T / T[-1]), 2 * np.sin(2 * math.pi * 3.3 * T / T[-1] + 1)
+    temperature = 25 - courses[0] + courses[1]
+    change = np.gradient(temperature, T)
+    course = np.array([[1.5], [0.0], [-0.8]]) * change / np.abs(change).max()
+    measured = temperature + 0.01 * np.random.default_rng(3).standard_normal(N)
+    (found,) = diagnosed(noise(8) + course, measured).findings
+    assert (found.mechanism, found.sensors) == ("temperature_drift", (0, 2))
+    assert "and its rate of change" in found.sentence
+    for i, size in ((0, 1.5), (2, -0.8)):
+        assert within(found.parameters[f"change[{i}]"], size / np.abs(change).max(), 2.0)
+
+
 @pytest.mark.slow
 def test_of_equals_the_cause_that_was_recorded_is_named() -> None:
     """A sine of one period is as good as the temperature that has it."""

@@ -176,21 +176,33 @@ def _temperature_designs(
     temperature = lagged(info, channel, row, 0.0, n_samples)
     return torch.stack(
         [
-            slow_ordinates(form.paths(temperature, lagged(info, channel, row, lag, n_samples), lag))
+            slow_ordinates(
+                form.paths(temperature, lagged(info, channel, row, lag, n_samples, moving=form.changes), lag)
+            )
             for lag in lags[:, 0].tolist()
         ]
     )
 
 
-def lagged(info: RecordingInfo, channel: str, row: int, lag: float, n_samples: int) -> Tensor:
-    """Temperature of what follows a channel with a lag in samples, `tau dy/dt = x - y`, from equilibrium, `(time,)`."""
+def lagged(info: RecordingInfo, channel: str, row: int, lag: float, n_samples: int, *, moving: bool = False) -> Tensor:
+    """Temperature of what follows a channel with a lag in samples, `tau dy/dt = x - y`, `(time,)`.
+
+    From equilibrium; or, `moving`, from a temperature that had changed at its first rate for long: a rate of change has
+    no start of its own. That rate is the slope of the channel over the first lag.
+    """
     x = info.channel_rows(channel)[row]
     if len(x) < n_samples:
         raise ValueError(
             f"`channels`: expected {channel!r} at {n_samples} samples or more, got {len(x)}; "
             "give it for the whole record"
         )
-    return late(x[:n_samples], lag)
+    if not moving or lag <= 0:
+        return late(x[:n_samples], lag)
+    t = torch.arange(n_samples, dtype=torch.float64)
+    first = min(max(round(lag), 2), n_samples)
+    from_middle = t[:first] - t[:first].mean()
+    slope = (x[:first] @ from_middle) / (from_middle @ from_middle)
+    return late(x[:n_samples] - slope * t, lag) + slope * (t - 1 / math.expm1(1 / lag))
 
 
 def edges() -> Tensor:

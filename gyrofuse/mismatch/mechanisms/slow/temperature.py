@@ -26,7 +26,8 @@ class TemperatureDrift(SlowEffect):
 
     `theta` is what a part has whose heat follows the temperature `T` of a channel with the lag `tau`:
     `tau d theta / dt = T - theta`. Where the way counts by which a temperature was reached, and not in all sensors
-    alike, `u = T(t) - T(0)` instead, and `change_i d theta / dt` is added. A smooth channel fits a random walk by
+    alike, `u = T(t) - T(0)` instead, and `change_i d theta / dt` is added, as if `T` had changed at its first rate before
+    the record as well. A smooth channel fits a random walk by
     chance: beside the likelihood, surrogates of the channel with random phases must do worse.
 
     Attributes:
@@ -123,7 +124,8 @@ class TemperatureDrift(SlowEffect):
 
     def paths(self, n_samples: int, info: RecordingInfo) -> Tensor:
         temperature, lagging = (
-            lagged(info, self.channel, self.row, lag, n_samples) for lag in (0.0, self.lag_s * info.rate)
+            lagged(info, self.channel, self.row, lag, n_samples, moving=bool(self.change))
+            for lag in (0.0, self.lag_s * info.rate)
         )
         return self.form.paths(temperature, lagging, self.lag_s)
 
