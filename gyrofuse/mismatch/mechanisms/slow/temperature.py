@@ -26,9 +26,9 @@ class TemperatureDrift(SlowEffect):
 
     `theta` is what a part has whose heat follows the temperature `T` of a channel with the lag `tau`:
     `tau d theta / dt = T - theta`. Where the way counts by which a temperature was reached, and not in all sensors
-    alike, `u = T(t) - T(0)` instead, and `change_i d theta / dt` is added, as if `T` had changed at its first rate before
-    the record as well. A smooth channel fits a random walk by
-    chance: beside the likelihood, surrogates of the channel with random phases must do worse.
+    alike, `u = T(t) - T(0)` instead, and `change_i d theta / dt` is added, as if `T` had changed at its first rate
+    before the record as well. A smooth channel fits a random walk by chance: beside the likelihood, surrogates of the
+    channel with random phases must do worse.
 
     Attributes:
         size: Coefficients, `(sensor,)`, unit of the signal per unit of temperature.

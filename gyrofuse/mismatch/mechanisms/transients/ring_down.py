@@ -245,7 +245,7 @@ def _ring_down(around: Surroundings, found: FittedTone, sensors: Sequence[int]) 
     if gain < near * rival:  # two that beat, or one after the other, look like one, more or less
         return []
     both = max(
-        around.two_modes(found, sensors),
+        around.two_modes(found, sensors, rival),
         around.two_knocks(found, sensors),
         key=lambda two: float(two[0].log_ratio[list(sensors)].sum()),
     )
