@@ -46,7 +46,8 @@ class Recording:
 
     Raises:
         TypeError: `signal` is not a floating point tensor.
-        ValueError: A rate that is not positive, or names and channels that do not fit the signal.
+        ValueError: A rate that is not positive, names, times and channels that do not fit the signal, names that come
+            twice, or times that do not increase.
     """
 
     signal: Tensor
@@ -80,6 +81,9 @@ class Recording:
             raise ValueError(
                 f"`sensors`: expected {n_sensors} names for shape {tuple(self.signal.shape)}, got {len(self.sensors)}"
             )
+        twice = next((name for k, name in enumerate(self.sensors) if name in self.sensors[:k]), None)
+        if twice is not None:
+            raise ValueError(f"`sensors`: expected a name of its own for each sensor, got {twice!r} twice")
         if self.axes and self.signal.shape[:-2] != (len(self.axes),):
             raise ValueError(
                 f"`axes`: expected one name for each entry of the leading dimension of {tuple(self.signal.shape)}, "
@@ -89,6 +93,13 @@ class Recording:
             fill(self, "time", torch.arange(n_samples, dtype=torch.float64) / self.rate)
         if self.time.shape != (n_samples,):
             raise ValueError(f"`time`: expected shape ({n_samples},), got {tuple(self.time.shape)}")
+        later = self.time.diff() > 0
+        if not bool(later.all()):
+            at = int((~later).nonzero()[0, 0])
+            raise ValueError(
+                f"`time`: expected times of a grid, each later than the one before, got {float(self.time[at + 1]):g} s "
+                f"after {float(self.time[at]):g} s at sample {at + 1}; order the samples by time"
+            )
         for name, values in self.channels.items():
             if values.shape[-1:] != (n_samples,):
                 raise ValueError(

@@ -75,11 +75,12 @@ class Emulation:
         """Errors of both filters and their ratio, in a few lines."""
         when, ratio, low, high = self.peak
         where = "during the outage" if self.outage is not None else "at most"
+        limits = f"[{low:.4f}, {high:.4f}]" if math.isfinite(low) else f"(no interval: {_MIN_FLIGHTS} flights at least)"
         end = int((self.time - (self.outage[1] if self.outage else float(self.time[-1]))).abs().argmin())
         lines = [
             f"{self.n_flights} flights of {float(self.time[-1]):g} s",
             f"Position error of the first model over that of the second, {where}: {ratio:.4f} "
-            f"[{low:.4f}, {high:.4f}] at {when:.5g} s",
+            f"{limits} at {when:.5g} s",
             f"{'':<10}{'position (m)':>14}{'attitude (deg)':>16}   at {float(self.time[end]):.5g} s",
         ]
         for name, position, attitude in zip(("first", "second"), self.position, self.attitude.rad2deg(), strict=True):

@@ -44,6 +44,12 @@ class TestByHand:
             gf.Recording(signal(), rate=1, channels={"temperature": torch.zeros(49)})
         with pytest.raises(ValueError, match="`time`: expected shape \\(50,\\)"):
             gf.Recording(signal(), rate=1, time=torch.zeros(3))
+        with pytest.raises(ValueError, match="`sensors`: expected a name of its own for each sensor, got 'a' twice"):
+            gf.Recording(signal(), rate=1, sensors=("a", "b", "a"))
+        time = torch.arange(50.0)
+        time[[20, 21]] = time[[21, 20]]
+        with pytest.raises(ValueError, match="`time`: expected times of a grid.* got 20 s after 21 s at sample 21"):
+            gf.Recording(signal(), rate=1, time=time)
 
     def test_select_and_convert(self):
         recording = gf.Recording(

@@ -269,6 +269,7 @@ def test_the_same_model_costs_the_same_and_a_wrong_one_more():
     short = Trajectory(flight().time[:8], flight().position[:8])
     asked = {"trajectory": short, "gnss": Gnss(outage=(60.0, 100.0)), "rate": 20.0, "n_flights": 60}
     same = compare_filters(truth, truth, **{**asked, "rate": 10.0, "n_flights": 4})
+    assert "1.0000 (no interval: 5 flights at least) at" in same.summary()
     torch.testing.assert_close(same.ratio, torch.ones_like(same.ratio), rtol=0, atol=0)
     other = compare_filters(wrong, truth, **asked)
     when, ratio, low, high = other.peak
