@@ -118,5 +118,5 @@ def fuse(
         title = f"Virtual gyro of {titled(logs)}"
         files.write_report(lambda: fusion_report(result, recording, virtual, title=title, remarks=remarks))
         files.write_json(result.to_dict)
-    say("\n".join([result.summary(), *remarks]))
+    say("\n".join([result.summary(), *remarks, *files.note]))
     say_notes(recording)

@@ -79,8 +79,7 @@ class Emulation:
         end = int((self.time - (self.outage[1] if self.outage else float(self.time[-1]))).abs().argmin())
         lines = [
             f"{self.n_flights} flights of {float(self.time[-1]):g} s",
-            f"Position error of the first model over that of the second, {where}: {ratio:.4f} "
-            f"{limits} at {when:.5g} s",
+            f"Position error of the first model over that of the second, {where}: {ratio:.4f} {limits} at {when:.5g} s",
             f"{'':<10}{'position (m)':>14}{'attitude (deg)':>16}   at {float(self.time[end]):.5g} s",
         ]
         for name, position, attitude in zip(("first", "second"), self.position, self.attitude.rad2deg(), strict=True):

@@ -48,7 +48,7 @@ class TestByHand:
             gf.Recording(signal(), rate=1, sensors=("a", "b", "a"))
         time = torch.arange(50.0)
         time[[20, 21]] = time[[21, 20]]
-        with pytest.raises(ValueError, match="`time`: expected times of a grid.* got 20 s after 21 s at sample 21"):
+        with pytest.raises(ValueError, match=r"`time`: expected times of a grid.* got 20 s after 21 s at sample 21"):
             gf.Recording(signal(), rate=1, time=time)
 
     def test_select_and_convert(self):

@@ -55,6 +55,14 @@ def runs_up_and_stays(seed: int) -> np.ndarray:
     return noise(seed) + 0.8 * np.cos(2 * math.pi * np.cumsum(f) / RATE) * (f > 15)
 
 
+def speeds_of_a_rotor(seed: int) -> np.ndarray:
+    """Four of them, at each of which it stays for 20 s, so that each is a line of the record."""
+    asked = np.repeat([14.0, 23.0, 35.0, 44.0], N // 4)
+    late = 1 - math.exp(-1 / (0.5 * RATE))
+    f = 14.0 + signal.lfilter([late], [1, late - 1], asked - 14.0)
+    return noise(seed) + np.array([[0.0], [0.8], [1.1]]) * np.cos(2 * math.pi * np.cumsum(f) / RATE)
+
+
 def tone_in_a_stop_band(seed: int) -> np.ndarray:
     filtered = signal.sosfilt(signal.butter(4, 24, fs=RATE, output="sos"), noise(seed), axis=-1)
     return filtered + 0.05 * np.cos(2 * math.pi * 72.1 * T)
@@ -147,6 +155,9 @@ CASES = {
     ),
     "runs up and stays": Case(
         runs_up_and_stays, ("chirp", "vibration_tone"), {"chirp.stop": 25.0, "vibration_tone.frequency": 60.0}
+    ),
+    "speeds of a rotor": Case(
+        speeds_of_a_rotor, ("chirp",), {"chirp.start_frequency": 14.0, "chirp.stop_frequency": 44.0}
     ),
     "tone in a stop band": Case(
         tone_in_a_stop_band,

@@ -137,7 +137,7 @@ def diagnose_whole_board(
         if board.judge is not None:
             sources["judge"] = board.judge.name
         files.write_json(lambda: {**sources, **found.to_dict()})
-    say("\n".join([found.summary(), *remarks]))
+    say("\n".join([found.summary(), *remarks, *files.note]))
 
 
 class _OfFile(NamedTuple):

@@ -144,7 +144,7 @@ def diagnose(
         if judge is not None:
             sources["judge"] = judge.name
         files.write_json(lambda: {**sources, **found.to_dict()})
-    say("\n".join([found.summary(), *remarks]))
+    say("\n".join([found.summary(), *remarks, *files.note]))
     for one in recordings:
         say_notes(one)
 

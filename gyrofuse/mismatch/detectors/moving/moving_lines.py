@@ -49,6 +49,17 @@ class MovingLine(NamedTuple):
     def p_value(self) -> float:
         return p_value_from_e_value(self.log_ratio)
 
+    @property
+    def n_rests(self) -> int:
+        """Number of frequencies, some bins apart, at each of which it stays for many segments, to a bin."""
+        many, near, apart = 16, 2.0, 4.0
+        if len(self.path) < many:
+            return 0
+        bins = (self.path * self.length).unfold(0, many, 1)  # (segment, many)
+        rests = bins.amax(-1) - bins.amin(-1) <= near  # not so beside NaN
+        middles = bins[rests].mean(-1).sort().values
+        return int((middles.diff() > apart).sum()) + 1 if len(middles) else 0
+
     def passes(self, sample: int, frequency: float) -> bool:
         """Whether it is there at a sample and a frequency, to three bins, and for many segments around."""
         at, many, near = sample // self.length, 16, 3.0
@@ -117,12 +128,33 @@ def moving_line(side: Records) -> MovingLine:
     return MovingLine(mean, length, torch.where(path >= 0, (path + _LOWEST) / length, math.nan))
 
 
-def _powers(white: Tensor, length: int) -> Tensor:
+def lines_that_rest(comparison: Comparison) -> list[MovingLine]:
+    """Likeliest paths of a tone that rests at several frequencies, at each for so long that it is a line there.
+
+    One for each length of segments: the shorter, the faster it may move from one rest to the next. Of the recording in
+    units of the simulation's noise: its own smooth spectrum has no lines, and no such rests. A tone that rests at one
+    frequency alone is none of them: that is a line by itself.
+    """
+    n, found = comparison.n_samples, list[MovingLine]()
+    for parts in (2, 1):
+        length = math.isqrt(n) // (2 * parts) * 2
+        if length < 32 or n // length < 32:
+            continue
+        power = _powers(comparison.white, length, dims=(-1,))
+        gains, ratios = _cell_ratios(power)
+        log_ratios = over_paths(ratios)
+        path = _likeliest(gains.flatten(0, 1)[int(log_ratios.argmax())])
+        path = torch.where(path >= 0, (path + _LOWEST) / length, math.nan)
+        found.append(MovingLine(float(log_ratios.max()), length, path))
+    return [line for line in found if line.n_rests > 1]
+
+
+def _powers(white: Tensor, length: int, dims: tuple[int, ...] = (-2, -1)) -> Tensor:
     """Of segments and bins of whitened samples `(sensor, time)`, over medians of bins and segments, `(sensor, ...)`."""
     count = white.shape[-1] // length
     segments = white[:, : count * length].unflatten(-1, (count, length))
     power = squared_modulus(torch.fft.rfft(segments * light_taper(length)))[..., _LOWEST:-1]
-    for dim in (-2, -1):
+    for dim in dims:
         power = power / (power.median(dim, keepdim=True).values / math.log(2)).clamp(min=1e-300)
     there = (segments != 0).to(power.dtype).mean(-1, keepdim=True)  # of segments at the ends little is left
     return torch.where(there > 0.5, power, 0.0)

@@ -11,7 +11,13 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.decisions import NATS_PER_NUMBER
-from gyrofuse.mismatch.detectors.moving.moving_lines import MovingLine, moving_line, moving_line_p_value, straight_line
+from gyrofuse.mismatch.detectors.moving.moving_lines import (
+    MovingLine,
+    lines_that_rest,
+    moving_line,
+    moving_line_p_value,
+    straight_line,
+)
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
@@ -55,7 +61,10 @@ class Chirp(Transient):
         lines = ((moving_line_p_value(comparison), moving_line(comparison.observed)), straight_line(comparison))
         info, n = comparison.info, comparison.n_samples
         p_value = sidak(min(p for p, _ in lines), 2)
-        courses = [_course(line, n) for p, line in lines if line is not None and sidak(p, 2) <= level]
+        if p_value > level:
+            return None
+        seen = [*(line for p, line in lines if sidak(p, 2) <= level), *lines_that_rest(comparison)]
+        courses = [_course(line, n) for line in seen if line is not None]
         tried = [cls._of_course(comparison, *course)._followed(comparison) for course in courses if course is not None]
         if not tried:
             return None
