@@ -55,10 +55,10 @@ class DampedTone(NamedTuple):
         turn = cmath.exp(complex(-1 / self.tau, 2 * math.pi * self.frequency))
         start = max(self.onset - first, 0)
         theta = math.pi / n * k
-        last, first_one, one = (_turned(samples * theta) for samples in (n - start, start + 0.5, 1))
+        turns = [_turned(samples * theta) for samples in (start + 0.5, n - start, 1)]
         total = torch.zeros(len(k), dtype=torch.complex128)
-        for end, begin, each in ((last, first_one, one), (last.conj(), first_one.conj(), one.conj())):
-            total += begin * (1 - turn ** (n - start) * end) / (1 - turn * each)
+        for begin, end, one in (turns, [each.conj() for each in turns]):
+            total += begin * (1 - turn ** (n - start) * end) / (1 - turn * one)
         return torch.view_as_real(turn ** (start + first - self.onset) / math.sqrt(2 * n) * total).mT
 
 
@@ -196,10 +196,10 @@ class Surroundings:
     def two_modes(self, start: FittedTone, sensors: Sequence[int], wanted: float) -> tuple[FittedTone, FittedTone]:
         """Two tones near a start that set in together: they beat, and seem to grow before they die away.
 
-        The log likelihood ratio of both is that of the first; the second has what it adds. Where onsets half a time
-        constant apart all are far from what is wanted, those between are not tried: they gain a fifth at most.
+        The log likelihood ratio of both is that of the first; the second has what it adds. Far from what is wanted
+        nothing is tried between onsets half a time constant apart.
         """
-        hopeless = 0.7
+        hopeless = 0.7  # of it: onsets between gain a fifth at most
         which, tone = list(sensors), start.tone
         onsets = [tone.onset - round(k / 2 * tone.tau) for k in range(-1, 5)]
         step = max(round(tone.tau / 8), 1)
@@ -208,8 +208,7 @@ class Surroundings:
             gain, first, second = max(tried, key=lambda one: one[0])
             if step == 1 or gain < hopeless * wanted:
                 break
-            step, onsets = max(step // 3, 1), [first.onset + k * step for k in (-2, -1, 0, 1, 2)]
-            tone = first
+            tone, step, onsets = first, max(step // 3, 1), [first.onset + k * step for k in (-2, -1, 0, 1, 2)]
         return self._both(first, second)
 
     def _both(self, first: DampedTone, second: DampedTone) -> tuple[FittedTone, FittedTone]:

@@ -38,15 +38,15 @@ class Spacing(NamedTuple):
         gap: From the last block of a run to the first of the next one, blocks; 1 where they follow each other, too.
     """
 
-    run: int
-    gap: float
+    run: int = 1
+    gap: float = 1.0
 
     def before(self, k: int) -> float:
         """From the block before to block `k`, blocks."""
         return self.gap if k and k % self.run == 0 else 1.0
 
 
-CLOSE = Spacing(1, 1.0)  # blocks that all follow each other
+CLOSE = Spacing()  # blocks that all follow each other
 
 
 class Background(NamedTuple):

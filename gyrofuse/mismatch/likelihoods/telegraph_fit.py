@@ -29,7 +29,6 @@ from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED, in_fold
 from gyrofuse.noise.processes import AR1
 
 _SEARCHING, _FINAL = 48, 192  # paths that are followed: of each trial, and of the values that are compared
-_MOST_BLOCKS = 2048  # of one sensor
 _FEWEST_BLOCKS = 2.0  # blocks in a time constant, at least: longer ones average the levels away
 _STENCIL = (0.15, 0.35)  # half widths of a stencil in log half step and log dwells, halved where likelihoods are steep
 _NEAR = 3.0  # nats below the largest value, over which a likelihood is a parabola
@@ -83,8 +82,8 @@ class Means(NamedTuple):
         block = 2 ** max(math.floor(math.log2(tau / 2.5)), 0)
         if tau < _FEWEST_BLOCKS * block:
             return None
-        part = comparison.n_samples // N_JUDGED  # samples
-        run = min(part // block, _MOST_BLOCKS // N_JUDGED)
+        part, most = comparison.n_samples // N_JUDGED, 2048  # samples; blocks in all
+        run = min(part // block, most // N_JUDGED)
         apart = part if part // block > run else run * block
         spacing = Spacing(run, 1 + apart / block - run)
 
