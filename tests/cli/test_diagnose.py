@@ -42,7 +42,7 @@ def test_prints_the_verdict_and_writes_what_is_asked_for(run: Run, log: Path):
     report = gf.diagnose(recording, gf.read_recording("sim.npz"))
     assert done.out.startswith("Recording and simulation differ")
     assert [f.mechanism for f in report.findings] == ["vibration_tone"]
-    assert done.out.strip() == str(report)
+    assert done.out.strip() == f"{report}\nWritten: c.npz, m.json, r.json, r.html"
     told = json.loads(Path("r.json").read_text())
     assert told == {"recording": ["log.npz"], "simulation": "sim.npz", **report.to_dict()}
     assert json.loads(Path("m.json").read_text()) == report.model.to_dict()
