@@ -124,8 +124,7 @@ def moving_line(side: Records) -> MovingLine:
     mean = float(values.flatten().logsumexp(0)) - math.log(values.numel())
     best, which = divmod(int(values.argmax()), values[0].numel())
     _, length, gains = scales[best]
-    path = _likeliest(gains.flatten(0, 1)[which])
-    return MovingLine(mean, length, torch.where(path >= 0, (path + _LOWEST) / length, math.nan))
+    return MovingLine(mean, length, _likeliest_path(gains, which, length))
 
 
 def lines_that_rest(comparison: Comparison) -> list[MovingLine]:
@@ -143,14 +142,22 @@ def lines_that_rest(comparison: Comparison) -> list[MovingLine]:
         power = _powers(comparison.white, length, dims=(-1,))
         gains, ratios = _cell_ratios(power)
         log_ratios = over_paths(ratios)
-        path = _likeliest(gains.flatten(0, 1)[int(log_ratios.argmax())])
-        path = torch.where(path >= 0, (path + _LOWEST) / length, math.nan)
-        found.append(MovingLine(float(log_ratios.max()), length, path))
+        best, which = log_ratios.max(0)
+        found.append(MovingLine(float(best), length, _likeliest_path(gains, int(which), length)))
     return [line for line in found if line.n_rests > 1]
 
 
+def _likeliest_path(gains: Tensor, which: int, length: int) -> Tensor:
+    """Frequencies `(segment,)` of one set and power of log likelihood ratios `(set, power, segment, bin)`."""
+    path = _likeliest(gains.flatten(0, 1)[which])
+    return torch.where(path >= 0, (path + _LOWEST) / length, math.nan)
+
+
 def _powers(white: Tensor, length: int, dims: tuple[int, ...] = (-2, -1)) -> Tensor:
-    """Of segments and bins of whitened samples `(sensor, time)`, over medians of bins and segments, `(sensor, ...)`."""
+    """Of segments and bins of whitened samples `(sensor, time)`, over medians along `dims`, `(sensor, segment, bin)`.
+
+    By default along segments, of a bin, and then along bins, of a segment.
+    """
     count = white.shape[-1] // length
     segments = white[:, : count * length].unflatten(-1, (count, length))
     power = squared_modulus(torch.fft.rfft(segments * light_taper(length)))[..., _LOWEST:-1]
