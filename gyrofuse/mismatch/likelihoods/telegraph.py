@@ -178,6 +178,7 @@ def switching_values(
         return (share / up)[:, None], (share / down)[:, None]
 
     leave, enter = switched(1.0)
+    phi = {blocks: background.phi**blocks for blocks in {1.0, spacing.gap}}
     upper = np.tile([False, True], (n_trials, 1))
     weight = np.concatenate([leave, enter], 1) / (leave + enter)
     mean = np.zeros((n_trials, 2, n_parts))
@@ -190,7 +191,7 @@ def switching_values(
             weight, upper = np.concatenate([weight - unseen, unseen], 1), np.concatenate([upper, ~upper], 1)
             mean = np.concatenate([mean, mean], 1)
         n_before = upper.shape[1]
-        mean = mean * background.phi**blocks
+        mean = mean * phi[blocks]
         e = value - mean.sum(-1)
         level = np.where(upper, half[:, None], -half[:, None])
         moved = weight * np.where(upper, leave, enter)
