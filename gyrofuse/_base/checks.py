@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from numbers import Real
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 
+_Value = TypeVar("_Value")
 _BITS = 63  # of the length of a tensor
 
 
@@ -25,6 +27,11 @@ def check_floating(name: str, value: Tensor) -> Tensor:
     if value.dtype not in (torch.float32, torch.float64):
         raise TypeError(f"`{name}`: expected float32 or float64, got {value.dtype}; convert with .to(torch.float64)")
     return value
+
+
+def first_twice(values: Sequence[_Value]) -> _Value | None:
+    """The first value that came before; None where each comes once."""
+    return next((value for k, value in enumerate(values) if value in values[:k]), None)
 
 
 def check_signal(name: str, value: Tensor) -> Tensor:

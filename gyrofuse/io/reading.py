@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from gyrofuse._base.checks import check_positive
+from gyrofuse._base.checks import check_positive, first_twice
 from gyrofuse._base.units import check_quantity, quantity_of
 from gyrofuse.io.assemble import assemble
 from gyrofuse.io.formats.columns import check_columns
@@ -71,8 +71,7 @@ def read_recording(
     paths = [Path(path)] if isinstance(path, str | Path) else [Path(p) for p in path]
     if not paths:
         raise ValueError("`path`: expected at least one file, got none")
-    places = [os.path.abspath(p) for p in paths]
-    twice = next((p for i, p in enumerate(places) if p in places[:i]), None)
+    twice = first_twice([os.path.abspath(p) for p in paths])
     if twice is not None:
         raise ValueError(f"`path`: expected each file once, got {twice} twice; name it once")
     check_reading(rate=rate, scale=scale, quantity=quantity, columns=columns)

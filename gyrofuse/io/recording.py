@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from gyrofuse._base.checks import check_positive, check_signal
+from gyrofuse._base.checks import check_positive, check_signal, first_twice
 from gyrofuse._base.deprecation import moved_names
 from gyrofuse._base.files import Outputs, write_npz
 from gyrofuse._base.results import listed, numbered
@@ -81,7 +81,7 @@ class Recording:
             raise ValueError(
                 f"`sensors`: expected {n_sensors} names for shape {tuple(self.signal.shape)}, got {len(self.sensors)}"
             )
-        twice = next((name for k, name in enumerate(self.sensors) if name in self.sensors[:k]), None)
+        twice = first_twice(self.sensors)
         if twice is not None:
             raise ValueError(f"`sensors`: expected a name of its own for each sensor, got {twice!r} twice")
         if self.axes and self.signal.shape[:-2] != (len(self.axes),):
@@ -91,15 +91,8 @@ class Recording:
             )
         if self.time is None:
             fill(self, "time", torch.arange(n_samples, dtype=torch.float64) / self.rate)
-        if self.time.shape != (n_samples,):
-            raise ValueError(f"`time`: expected shape ({n_samples},), got {tuple(self.time.shape)}")
-        later = self.time.diff() > 0
-        if not bool(later.all()):
-            at = int((~later).nonzero()[0, 0])
-            raise ValueError(
-                f"`time`: expected times of a grid, each later than the one before, got {float(self.time[at + 1]):g} s "
-                f"after {float(self.time[at]):g} s at sample {at + 1}; order the samples by time"
-            )
+        else:
+            _check_time(self.time, n_samples)
         for name, values in self.channels.items():
             if values.shape[-1:] != (n_samples,):
                 raise ValueError(
@@ -145,9 +138,9 @@ class Recording:
             which = [_position(names, sensor) for sensor in sensors]
             if not which:
                 raise ValueError(f"`sensors`: expected some of {_named(names)}, got none")
-            twice = next((names[i] for k, i in enumerate(which) if i in which[:k]), None)
+            twice = first_twice(which)
             if twice is not None:
-                raise ValueError(f"`sensors`: expected each sensor once, got {twice!r} twice; name it once")
+                raise ValueError(f"`sensors`: expected each sensor once, got {names[twice]!r} twice; name it once")
             signal, names = signal[..., which, :], tuple(names[i] for i in which)
         return replace(self, signal=signal, axes=axes, sensors=names)
 
@@ -307,6 +300,19 @@ def _position(names: Sequence[str], sensor: str | int) -> int:
     if not isinstance(sensor, str) and 0 <= sensor < len(names):
         return sensor
     raise ValueError(f"`sensors`: expected some of {_named(names)}, got {sensor!r}")
+
+
+def _check_time(time: Tensor, n_samples: int) -> None:
+    """Times of a grid increase."""
+    if time.shape != (n_samples,):
+        raise ValueError(f"`time`: expected shape ({n_samples},), got {tuple(time.shape)}")
+    later = time.diff() > 0
+    if not bool(later.all()):
+        at = int((~later).nonzero()[0, 0])
+        raise ValueError(
+            f"`time`: expected times of a grid, each later than the one before, got {float(time[at + 1]):g} s "
+            f"after {float(time[at]):g} s at sample {at + 1}; order the samples by time"
+        )
 
 
 def _named(names: Sequence[str]) -> str:
