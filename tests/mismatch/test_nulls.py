@@ -11,6 +11,7 @@ import torch
 from mismatch_draws import LEVEL, even, normal
 from scipy import signal, stats
 from scipy.signal import butter, lfilter
+from slow_cases import slow_but_for
 from torch import Tensor
 
 import gyrofuse as gf
@@ -381,10 +382,10 @@ def test_a_steep_filter_makes_no_outliers_and_changes_no_level(taps, n: int):
     assert noise_level.variance_test(given).p_value > LEVEL
 
 
-FORMS = ("high", "triangle", "average", "pole", "butterworth", "steep", "low", "windowed", "band", "difference")
+FORMS = ("pole", "butterworth", "steep", "low", "average", "triangle", "windowed", "high", "band", "difference")
 
 
-@pytest.mark.parametrize("form", [*FORMS[:2], *(pytest.param(form, marks=pytest.mark.slow) for form in FORMS[2:])])
+@pytest.mark.parametrize("form", slow_but_for(("high", "triangle"), FORMS))
 def test_what_a_filter_leaves_alike_on_both_sides_is_no_mismatch(form: str):
     """Stop bands and zeros that recording and simulation share: leakage, few ordinates and ends are no evidence."""
     numerator, denominator = {

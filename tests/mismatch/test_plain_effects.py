@@ -13,6 +13,7 @@ import torch
 from bounds import at_least
 from mismatch_draws import SCENE, drawn
 from scipy import signal
+from slow_cases import slow_but_for
 from torch import Tensor
 
 import gyrofuse as gf
@@ -204,10 +205,9 @@ CASES = {
 
 
 QUICK = ("rotor", "thermostat", "handled", "converters in turns", "switches", "shocks")
-EACH = [pytest.param(case, id=name, marks=() if name in QUICK else pytest.mark.slow) for name, case in CASES.items()]
 
 
-@pytest.mark.parametrize("case", EACH)
+@pytest.mark.parametrize("case", slow_but_for(QUICK, CASES))
 def test_it_is_named_and_nothing_else_is(case: Case) -> None:
     report = diagnosed(case.recording(1))
     assert sorted(f.mechanism for f in report.findings) == sorted(case.names)

@@ -10,6 +10,7 @@ from bounds import at_most
 from matplotlib.figure import Figure
 from mismatch_draws import normal
 from scipy import signal
+from slow_cases import slow_but_for
 from torch import Tensor
 
 import gyrofuse as gf
@@ -205,12 +206,10 @@ def others(kind: str, g: torch.Generator) -> Tensor:
     return of_nats(torch.sin(2 * math.pi * (0.2 * t + (0.01 * steps).cumsum(-1))), 2000.0)
 
 
-LIKE_ONE = ("step", "spike", "louder", "tone", "swelling", "wandering tone")
+LIKE_ONE = ("spike", "step", "louder", "tone", "swelling", "wandering tone")
 
 
-@pytest.mark.parametrize(
-    "kind", [*LIKE_ONE[:1], *(pytest.param(kind, marks=pytest.mark.slow) for kind in LIKE_ONE[1:])]
-)
+@pytest.mark.parametrize("kind", slow_but_for(("step",), LIKE_ONE))
 def test_what_looks_like_one_has_another_name(kind: str):
     for seed in range(2):
         g = generator(seed)

@@ -20,6 +20,7 @@ from shape_draws import (
     tensor,
     wandering,
 )
+from slow_cases import slow_but_for
 from torch import Tensor
 
 import gyrofuse as gf
@@ -213,12 +214,10 @@ def test_signals_have_the_spectra_that_a_mechanism_promises(name: str):
     assert float((error.amax((-1, -2)) / spread)[high].max()) < 12.0
 
 
-REFITTED = ("filter", "levels", "own modes", "one mode", "flicker", "white in common")
+REFITTED = ("levels", "filter", "own modes", "one mode", "flicker", "white in common")
 
 
-@pytest.mark.parametrize(
-    "name", [*REFITTED[:1], *(pytest.param(name, marks=pytest.mark.slow) for name in REFITTED[1:])]
-)
+@pytest.mark.parametrize("name", slow_but_for(("filter",), REFITTED))
 def test_numbers_without_a_fold_are_near_those_of_all(name: str):
     _, change, _ = CHANGES[name]
     given = drawn(17, change)
