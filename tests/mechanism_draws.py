@@ -12,9 +12,11 @@ import torch
 from torch import Tensor
 
 import gyrofuse as gf
+from gyrofuse.mismatch.likelihoods.laws.bend import Curve
 from gyrofuse.mismatch.likelihoods.spectra.filter_forms import filter_strength
 from gyrofuse.mismatch.mechanisms.regimes.channel_noise import ChannelNoise
 from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
+from gyrofuse.mismatch.mechanisms.regimes.heavy_tails import HeavyTailedNoise
 from gyrofuse.mismatch.mechanisms.regimes.scale_mixture import ScaleMixture
 from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
 from gyrofuse.mismatch.mechanisms.regimes.telegraph import RandomTelegraph
@@ -67,15 +69,16 @@ from gyrofuse.mismatch.mechanisms.transients.chirp import Chirp
 from gyrofuse.mismatch.mechanisms.transients.pulses import Pulses
 from gyrofuse.mismatch.mechanisms.transients.ring_down import RingDown
 from gyrofuse.mismatch.mechanisms.transients.tone_in_spells import ToneInSpells
-from gyrofuse.mismatch.mechanisms.values.angle_quantization import AngleCounts, AngleQuantization
 from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
-from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
 from gyrofuse.mismatch.mechanisms.values.held_values import HeldValues
 from gyrofuse.mismatch.mechanisms.values.interleaving import Interleaving
 from gyrofuse.mismatch.mechanisms.values.interpolated_samples import InterpolatedSamples
 from gyrofuse.mismatch.mechanisms.values.median_filter import MedianFilter
-from gyrofuse.mismatch.mechanisms.values.missing_codes import MissingCodes
-from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
+from gyrofuse.mismatch.mechanisms.values.nonlinearity import Nonlinearity
+from gyrofuse.mismatch.mechanisms.values.rounding.angle_quantization import AngleCounts, AngleQuantization
+from gyrofuse.mismatch.mechanisms.values.rounding.dead_band import DeadBand
+from gyrofuse.mismatch.mechanisms.values.rounding.missing_codes import MissingCodes
+from gyrofuse.mismatch.mechanisms.values.rounding.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.values.sensor_gain import SensorGain
 from gyrofuse.mismatch.mechanisms.values.sensor_order import SensorOrder
 from gyrofuse.mismatch.mechanisms.values.stuck_samples import StuckSamples
@@ -149,6 +152,27 @@ def _shares(setting: Setting, low: float, high: float, most: float) -> tuple[Ten
     return (torch.where(share > 0, share.max(), 0.0) if together else share), together
 
 
+@draws(Nonlinearity)
+def _(setting: Setting) -> Drawn:
+    """Of another gain on either side, or of a smaller one at both ends."""
+    spread, size = setting.clean.std(-1), min(0.5 * setting.size, 2.0)
+    bend = setting.signed(0.6, 0.9) * size if setting.chance() else setting.sizes(0.6, 0.9) * size
+    ends = (-0.6 * bend).exp(), bend.exp()
+    one = torch.ones_like(bend)
+    slopes = torch.stack([ends[1] if bool((bend >= 0).all()) else ends[0], one, ends[1]], -1)
+    knots = spread[:, None] * torch.tensor([-2.0, 0.0, 2.0], dtype=torch.float64)
+    effect = Nonlinearity(setting.clean.mean(-1), torch.zeros_like(bend), knots, slopes)
+    curves = [Curve(*own) for own in zip(knots.numpy(), slopes.numpy(), strict=True)]
+    numbers = torch.stack(
+        [torch.from_numpy(c.coefficients(0.0, float(sd))) for c, sd in zip(curves, spread, strict=True)]
+    )
+    numbers = torch.where(bend[:, None] != 0, numbers, 0.0)
+    truth = {
+        f"{name}[{i}]": float(numbers[i, k]) for i in setting.concerned for k, name in enumerate(("quadratic", "cubic"))
+    }
+    return Drawn(effect, truth)
+
+
 @draws(StuckSamples)
 def _(setting: Setting) -> Drawn:
     probability, together = _shares(setting, 0.001, 0.003, 0.9)
@@ -220,6 +244,16 @@ def _(setting: Setting) -> Drawn:
     ratio = 1.0 + setting.sizes(1.5, 2.5) * min(setting.size, 3.0)
     truth = setting.of_each("share", 100 * share) | setting.of_each("ratio", ratio)
     return Drawn(ScaleMixture(share, ratio), truth)
+
+
+@draws(HeavyTailedNoise)
+def _(setting: Setting) -> Drawn:
+    """Of one law in all sensors concerned: the other is none that any of them has."""
+    shape, none = setting.sizes(0.8, 2.0) * min(setting.size, 3.0), setting.sizes(0.0, 0.0)
+    if setting.chance():
+        return Drawn(HeavyTailedNoise(none, shape), setting.of_each("laplace_width", shape))
+    freedom = torch.where(shape > 0, 2.5 + 4 / shape.clamp(min=0.1), 0.0)
+    return Drawn(HeavyTailedNoise(freedom, none), setting.of_each("freedom", freedom))
 
 
 @draws(VarianceChange)

@@ -28,7 +28,7 @@ from gyrofuse.mismatch.mechanisms.spectra.bumps.wandering_tone import DriftingTo
 from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
 from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
-from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
+from gyrofuse.mismatch.mechanisms.values.rounding.quantization import Quantization
 from gyrofuse.mismatch.reporting.text import otherwise_words
 from gyrofuse.mismatch.selection import alternatives
 from gyrofuse.mismatch.selection.alternatives import compare, rivals_of

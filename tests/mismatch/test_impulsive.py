@@ -17,7 +17,7 @@ from gyrofuse import AR1, RandomWalk, Recording, WhiteNoise, diagnose
 from gyrofuse.mismatch.detectors.values import values as marginals
 from gyrofuse.mismatch.detectors.variance import haar_kurtosis, noise_level
 from gyrofuse.mismatch.detectors.variance import outliers as impulses
-from gyrofuse.mismatch.likelihoods import outlier_law as outliers
+from gyrofuse.mismatch.likelihoods.laws import outlier_law as outliers
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.mechanisms.regimes import outlier_limits, spikes
 from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
@@ -25,7 +25,7 @@ from gyrofuse.mismatch.mechanisms.regimes.telegraph import RandomTelegraph, _pat
 from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
 from gyrofuse.mismatch.mechanisms.simulated.spikes import SimulatedSpikes
 from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
-from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
+from gyrofuse.mismatch.mechanisms.values.rounding.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.values.stuck_samples import StuckSamples
 from gyrofuse.mismatch.selection.discrepancy import leads_away
 from gyrofuse.mismatch.signals import prediction_errors

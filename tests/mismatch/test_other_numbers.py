@@ -10,7 +10,7 @@ from scipy import signal
 import gyrofuse as gf
 from gyrofuse.mismatch import Finding, MismatchReport
 from gyrofuse.mismatch.detectors.values.truncation import is_cut_off, step_counts
-from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
+from gyrofuse.mismatch.mechanisms.values.rounding.quantization import Quantization
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 
 RATE, N = 200.0, 24_000

@@ -16,7 +16,8 @@ from gyrofuse.mismatch.detectors.moving import chirps as sweeps
 from gyrofuse.mismatch.detectors.slow import hysteresis
 from gyrofuse.mismatch.detectors.variance import modulation, noise_level
 from gyrofuse.mismatch.detectors.variance import outliers as impulses
-from gyrofuse.mismatch.likelihoods import outlier_law as outliers
+from gyrofuse.mismatch.likelihoods.laws import outlier_law as outliers
+from gyrofuse.mismatch.likelihoods.laws.heavy_tails import HeavyTails, heavy_tailed
 from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
 from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
 from gyrofuse.mismatch.mechanisms.spectra import joint_fit as shapes
@@ -144,9 +145,20 @@ def test_witnesses_are_honest() -> None:
 
 
 def test_heavy_tailed_laws_are_normalised() -> None:
-    for law, numbers in ((outliers._student, (4.0, 0.8)), (outliers._normal_laplace, (0.5, 0.8))):
-        total, _ = integrate.quad(lambda x, law=law, numbers=numbers: math.exp(law(np.array(x), *numbers)), -60, 60)
+    for law in (HeavyTails(False, 4.0, 0.8), HeavyTails(True, 0.6, 0.8)):
+        total, _ = integrate.quad(lambda x, law=law: math.exp(law.log_density(np.array(x))), -60, 60)
         assert total == pytest.approx(1, abs=1e-6)
+
+
+@pytest.mark.parametrize("law", [HeavyTails(False, 4.0, 0.8), HeavyTails(True, 0.6, 0.8)])
+def test_heavy_tailed_laws_are_normal_with_the_variances_that_they_draw(law: HeavyTails) -> None:
+    g = torch.Generator().manual_seed(3)
+    z = normal(200_000, g=g)
+    spread = law.scale * math.sqrt(1 + 2 * law.shape**2 if law.laplace else law.shape / (law.shape - 2))
+    drawn = spread * law.factors(z, g) * z
+    again = HeavyTails.of_kind(law.laplace, drawn)
+    assert abs(math.log(again.shape / law.shape)) < 4 * again.log_shape_sd(drawn) < 0.2
+    assert HeavyTails.fitted(drawn).laplace is law.laplace
 
 
 def with_laplace(seed: int, size: float) -> Comparison:
@@ -171,8 +183,8 @@ def test_a_few_outliers_are_no_other_law_of_all_noise() -> None:
     rare = z + (even(N, g=g) < 1e-3) * 5.0
     law = outliers.fitted(rare)
     gain = float((outliers.mixture(rare, law) - outliers.free_gaussian(rare)).sum())
-    assert gain > outliers.heavy_tailed(rare) + 10
-    assert outliers.heavy_tailed(z) < 4  # half a chi-square but for one in a thousand
+    assert gain > heavy_tailed(rare) + 10
+    assert heavy_tailed(z) < 4  # half a chi-square but for one in a thousand
 
 
 # Starts, stops and factors.

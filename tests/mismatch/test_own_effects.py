@@ -11,7 +11,7 @@ from torch import Tensor
 import gyrofuse as gf
 from gyrofuse.mismatch.mechanisms.signals.g_sensitivity import GSensitivity
 from gyrofuse.mismatch.mechanisms.slow.step import Step
-from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
+from gyrofuse.mismatch.mechanisms.values.rounding.quantization import Quantization
 from gyrofuse.mismatch.repair.inputs import prepared
 from gyrofuse.mismatch.repair.reference_effects import with_own_effects
 from gyrofuse.mismatch.repair.repaired_model import RepairedModel

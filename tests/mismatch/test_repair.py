@@ -15,7 +15,7 @@ from gyrofuse.mismatch.mechanisms.remainders.slow import SlowRemainder
 from gyrofuse.mismatch.mechanisms.remainders.spectrum import Remainder
 from gyrofuse.mismatch.mechanisms.slow.step import Step
 from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
-from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
+from gyrofuse.mismatch.mechanisms.values.rounding.quantization import Quantization
 from gyrofuse.mismatch.repair.repaired_model import RepairedModel
 from gyrofuse.mismatch.reporting.text import verdict
 from gyrofuse.mismatch.selection import forward

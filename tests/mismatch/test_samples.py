@@ -12,7 +12,7 @@ from torch import Tensor
 import gyrofuse as gf
 from gyrofuse.mismatch.detectors.values.lattices import exact_lattices
 from gyrofuse.mismatch.detectors.values.quantisation_grid import missing_lattices
-from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
+from gyrofuse.mismatch.mechanisms.values.rounding.quantization import Quantization
 from gyrofuse.mismatch.signals.comparison import Comparison
 
 N, P, RATE = 16384, 3, 100.0

@@ -19,6 +19,7 @@ from gyrofuse.mismatch.mechanisms.catalogue import CATALOGUE
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.mechanisms.regimes.channel_noise import ChannelNoise
 from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
+from gyrofuse.mismatch.mechanisms.regimes.heavy_tails import HeavyTailedNoise
 from gyrofuse.mismatch.mechanisms.regimes.scale_mixture import ScaleMixture
 from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
 from gyrofuse.mismatch.mechanisms.regimes.telegraph import RandomTelegraph
@@ -70,15 +71,16 @@ from gyrofuse.mismatch.mechanisms.transients.chirp import Chirp
 from gyrofuse.mismatch.mechanisms.transients.pulses import Pulses
 from gyrofuse.mismatch.mechanisms.transients.ring_down import RingDown
 from gyrofuse.mismatch.mechanisms.transients.tone_in_spells import ToneInSpells
-from gyrofuse.mismatch.mechanisms.values.angle_quantization import AngleCounts, AngleQuantization
 from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
-from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
 from gyrofuse.mismatch.mechanisms.values.held_values import HeldValues
 from gyrofuse.mismatch.mechanisms.values.interleaving import Interleaving
 from gyrofuse.mismatch.mechanisms.values.interpolated_samples import InterpolatedSamples
 from gyrofuse.mismatch.mechanisms.values.median_filter import MedianFilter
-from gyrofuse.mismatch.mechanisms.values.missing_codes import MissingCodes
-from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
+from gyrofuse.mismatch.mechanisms.values.nonlinearity import Nonlinearity
+from gyrofuse.mismatch.mechanisms.values.rounding.angle_quantization import AngleCounts, AngleQuantization
+from gyrofuse.mismatch.mechanisms.values.rounding.dead_band import DeadBand
+from gyrofuse.mismatch.mechanisms.values.rounding.missing_codes import MissingCodes
+from gyrofuse.mismatch.mechanisms.values.rounding.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.values.sensor_gain import SensorGain
 from gyrofuse.mismatch.mechanisms.values.sensor_order import SensorOrder
 from gyrofuse.mismatch.mechanisms.values.stuck_samples import StuckSamples
@@ -112,6 +114,12 @@ EVERY = (
     Quantization(numbers(0.3, 0.0), numbers(0.01, 0.0), numbers(0.0, 0.0), numbers(1 / 3, 0.1), (0.0, 1 / 3)),
     Quantization(numbers(0.3, 0.1), numbers(0.0, 0.0), numbers(0.0, 0.0), numbers(1 / 3, 0.1), (), (True, False)),
     Clipping(numbers(-0.7, -math.inf), numbers(math.inf, 1 / 3), numbers(0.1, 0.2)),
+    Nonlinearity(
+        numbers(0.1, 0.2),
+        numbers(1 / 30, 0.0),
+        torch.tensor([[-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]], dtype=torch.float64),
+        torch.tensor([[2 / 3, 1.0, 1.5], [1.0, 1.0, 1.0]], dtype=torch.float64),
+    ),
     StuckSamples(numbers(0.2, 0.1), numbers(0.01, 0.0), True),
     MedianFilter(numbers(5.0, 1.0), numbers(0.3, 0.0), numbers(0.01, 0.0)),
     MissingCodes(numbers(1 / 3, 0.0), numbers(0.01, 0.0), ((0, 0, -1), ())),
@@ -119,6 +127,7 @@ EVERY = (
     HeldValues(numbers(2.5, 1.0), numbers(0.3, 0.0), numbers(0.01, 0.0)),
     StuckSamples(numbers(0.2, 0.0), numbers(0.01, 0.0), False, (7.3, 1.0), (1 / 3, 0.0)),
     StuckSamples(numbers(0.2, 0.0), numbers(0.01, 0.0), False, (), (1 / 3, 0.0)),  # of single samples
+    HeavyTailedNoise(numbers(4 / 3 + 1, 0.0), numbers(0.0, 1 / 3)),
     ScaleMixture(numbers(0.2, 0.0), numbers(3.0, 1.0)),
     Spikes(numbers(0.05, 0.0), numbers(7 / 3, 0.0), numbers(0.3, 0.0), True),
     SimulatedSpikes(Spikes(numbers(0.05, 0.0), numbers(7 / 3, 0.0), numbers(0.3, 0.0), False)),

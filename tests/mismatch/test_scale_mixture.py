@@ -11,7 +11,7 @@ from scipy import signal as dsp
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse.mismatch.likelihoods.two_levels import TwoLevels
+from gyrofuse.mismatch.likelihoods.laws.two_levels import TwoLevels
 from gyrofuse.mismatch.mechanisms.regimes.scale_mixture import ScaleMixture
 from gyrofuse.mismatch.signals.prediction_errors import scaled_innovations
 

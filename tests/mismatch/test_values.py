@@ -19,10 +19,10 @@ from gyrofuse.mismatch.detectors.values.straight_lines import straight_lines
 from gyrofuse.mismatch.detectors.variance import outliers as impulses
 from gyrofuse.mismatch.detectors.variance.noise_level import variance_p_value
 from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
-from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
 from gyrofuse.mismatch.mechanisms.values.interpolated_samples import InterpolatedSamples
 from gyrofuse.mismatch.mechanisms.values.median_filter import MedianFilter
-from gyrofuse.mismatch.mechanisms.values.quantization import Quantization, _blurred
+from gyrofuse.mismatch.mechanisms.values.rounding.dead_band import DeadBand
+from gyrofuse.mismatch.mechanisms.values.rounding.quantization import Quantization, _blurred
 from gyrofuse.mismatch.mechanisms.values.stuck_samples import StuckSamples
 from gyrofuse.mismatch.selection.held_out import score_held_out
 from gyrofuse.mismatch.signals import prediction_errors

@@ -20,12 +20,12 @@ from gyrofuse.mismatch.detectors.values.values import values_test
 from gyrofuse.mismatch.detectors.variance import weak_outliers as shocks
 from gyrofuse.mismatch.detectors.variance.noise_level import compared_levels, level_between, whitened_recording
 from gyrofuse.mismatch.diagnose import diagnose
-from gyrofuse.mismatch.likelihoods.outlier_law import Outliers, fitted_shock, shock_posterior, shock_scores
+from gyrofuse.mismatch.likelihoods.laws.outlier_law import Outliers, fitted_shock, shock_posterior, shock_scores
 from gyrofuse.mismatch.mechanisms.mechanism import Finding
 from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
 from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
-from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
-from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
+from gyrofuse.mismatch.mechanisms.values.rounding.dead_band import DeadBand
+from gyrofuse.mismatch.mechanisms.values.rounding.quantization import Quantization
 from gyrofuse.mismatch.selection.held_out import score_held_out
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.folds import sd_of_sum

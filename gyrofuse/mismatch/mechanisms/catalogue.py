@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.mechanisms.regimes.channel_noise import ChannelNoise
 from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
+from gyrofuse.mismatch.mechanisms.regimes.heavy_tails import HeavyTailedNoise
 from gyrofuse.mismatch.mechanisms.regimes.scale_mixture import ScaleMixture
 from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
 from gyrofuse.mismatch.mechanisms.regimes.telegraph import RandomTelegraph
@@ -61,15 +62,16 @@ from gyrofuse.mismatch.mechanisms.transients.chirp import Chirp
 from gyrofuse.mismatch.mechanisms.transients.pulses import Pulses
 from gyrofuse.mismatch.mechanisms.transients.ring_down import RingDown
 from gyrofuse.mismatch.mechanisms.transients.tone_in_spells import ToneInSpells
-from gyrofuse.mismatch.mechanisms.values.angle_quantization import AngleCounts, AngleQuantization
 from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
-from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
 from gyrofuse.mismatch.mechanisms.values.held_values import HeldValues
 from gyrofuse.mismatch.mechanisms.values.interleaving import Interleaving
 from gyrofuse.mismatch.mechanisms.values.interpolated_samples import InterpolatedSamples
 from gyrofuse.mismatch.mechanisms.values.median_filter import MedianFilter
-from gyrofuse.mismatch.mechanisms.values.missing_codes import MissingCodes
-from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
+from gyrofuse.mismatch.mechanisms.values.nonlinearity import Nonlinearity
+from gyrofuse.mismatch.mechanisms.values.rounding.angle_quantization import AngleCounts, AngleQuantization
+from gyrofuse.mismatch.mechanisms.values.rounding.dead_band import DeadBand
+from gyrofuse.mismatch.mechanisms.values.rounding.missing_codes import MissingCodes
+from gyrofuse.mismatch.mechanisms.values.rounding.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.values.sensor_gain import SensorGain
 from gyrofuse.mismatch.mechanisms.values.sensor_order import SensorOrder
 from gyrofuse.mismatch.mechanisms.values.stuck_samples import StuckSamples
@@ -82,11 +84,12 @@ def _stage_of(kind: type[Mechanism]) -> int:
 
 STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (SensorOrder,),  # whatever else is looked for sensor by sensor
+    (Nonlinearity,),  # which changes the level as well
     (UnitScale, SensorGain),
     # Facts on the numbers themselves.
     (AngleCounts,),  # whose values lie on a grid as rounded ones do
     (MedianFilter, Quantization, MissingCodes, Clipping, HeldValues, StuckSamples, InterpolatedSamples),
-    (Spikes, SimulatedSpikes, ScaleMixture),
+    (Spikes, SimulatedSpikes, ScaleMixture, HeavyTailedNoise),
     (ClockSkew, TimeScale),
     (GSensitivity, QuadraticCoupling, ScaleFactor, DriftingScale, ChannelCoupling, ChannelTransfer),
     (Motion,),  # whose smooth course looks like any of these

@@ -82,6 +82,7 @@ class Comparison:
         modes: Centre and half width of narrow noise that was built in, cycles per sample: it is no line, however like
             one it looks.
         filters: Names of filters that were built in, and factors `(sensor, frequency)` by which they changed powers.
+        straightened: Sensors whose bent scale was taken back: what is left of a curve's form shows in their values.
         passed_over: Names of shapes of spectra that were tried and do not hold: others come before them.
         seed: Seed of the random numbers that tests draw: that of the caller's generator.
     """
@@ -96,6 +97,7 @@ class Comparison:
     bent: tuple[Callable[[Tensor], Tensor], ...] = ()
     modes: tuple[tuple[float, float], ...] = ()
     filters: tuple[tuple[str, Callable[[Tensor], Tensor]], ...] = ()
+    straightened: tuple[int, ...] = ()
     passed_over: tuple[str, ...] = ()
     seed: int = 0
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from . import common_noise, filters, forms, marginal, shapes, spectral, strange
+from . import common_noise, filters, forms, marginal, response, shapes, spectral, strange
 from .bench import Bench, Part
 
 GROUPS = ("mechanism", "null", "pair", "two", "outside", "unidentifiable")  # and "real", which needs recordings
@@ -48,6 +48,7 @@ _MECHANISMS: dict[str, Callable[[Bench, float], Part]] = {
     "dead_band": marginal.dead_band,
     "clipping": marginal.clipping,
     "stuck_samples": marginal.stuck_samples,
+    "nonlinearity": response.nonlinearity,
     "spikes_shock": _with(marginal.spikes, simultaneous=True),
     "spikes_bus": _with(marginal.spikes, simultaneous=False),
     "variance_change": marginal.variance_change,
@@ -122,7 +123,6 @@ _COMBINED: dict[str, tuple[str, str]] = {
 }
 
 _OUTSIDE: dict[str, Callable[[Bench, float], Part]] = {
-    "laplace_noise": strange.laplace_noise,
     "cyclostationary_noise": _with(strange.modulated_noise, slow=False),
     "am_noise": _with(strange.modulated_noise, slow=True),
     "hysteresis": strange.hysteresis,
@@ -141,6 +141,7 @@ _FORMS: dict[str, Callable[[Bench, float], Part]] = {
     "high_pass": filters.high_pass,
     "band_stop": filters.band_stop,
     "harmonics": forms.harmonics,
+    "laplace_noise": strange.laplace_noise,
     "rotor": forms.rotor,
     "bursts_of_a_tone": forms.bursts_of_a_tone,
     "curved_temperature": forms.curved_temperature,

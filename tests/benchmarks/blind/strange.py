@@ -80,7 +80,14 @@ def laplace_noise(bench: Bench, nats: float) -> Part:
         return float(np.interp(e, grid, log_ratio).sum())
 
     return Part(
-        "laplace_noise", nats, sensors, llr, signal=signal, base=replace(bench.base, white=white), oracle_law="bound"
+        "scale_mixture",
+        nats,
+        sensors,
+        llr,
+        signal=signal,
+        base=replace(bench.base, white=white),
+        oracle_law="bound",
+        form="laplace",
     )
 
 

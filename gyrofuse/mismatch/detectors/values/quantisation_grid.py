@@ -219,7 +219,8 @@ def missing_lattices(comparison: Comparison, level: float) -> Missing:
     }
     p_value = 0.0 if missing or coarser else 1.0
     values = distinct_values(comparison.as_came)
-    hidden = [i for i, own in enumerate(observed) if own is None and not _is_cut(values[i][1])]
+    smooth = [i for i, own in enumerate(observed) if own is None and i not in comparison.straightened]
+    hidden = [i for i in smooth if not _is_cut(values[i][1])]
     while hidden:
         p, here = _hidden_in(comparison, hidden, level)
         p_value = min(p_value, p)

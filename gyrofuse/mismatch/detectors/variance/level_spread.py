@@ -145,3 +145,16 @@ def _effective_samples(side: Records) -> float:
     by_chance = 2 / WINDOW
     spread = max(float(level.var(-1).mean(0).max()) - by_chance, 0.0)
     return n_records * n / (1 + spread * (1 + n_records * n / side.bands.n_samples))
+
+
+def level_lasts(z: Tensor) -> bool:
+    """Whether the level of values `(time,)` lasts over neighbouring samples, as in episodes: then it is none of these.
+
+    By the correlations of the log moduli, which outliers hardly move, at distances of 1 to 9 samples: of one of them,
+    or of all together, as where jumps or knocks take some samples each.
+    """
+    log_size = z.abs().clamp(min=1e-3 * float(z.abs().median())).log()
+    log_size = log_size - log_size.mean()
+    lags = [float((log_size[k:] * log_size[:-k]).mean() / log_size.square().mean()) for k in range(1, 10)]
+    n, one, all_of_them = len(z), 0.1, 0.02  # a tenth: less than a seventh of the samples would last
+    return max(lags) > max(one, 4 / math.sqrt(n)) or sum(lags) / 9 > max(all_of_them, 4 / math.sqrt(9 * n))

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from scipy import optimize
 from torch import Tensor
 
-from gyrofuse.mismatch.likelihoods.outlier_law import Array, Outliers, Sample, bounds_of
+from gyrofuse.mismatch.likelihoods.laws.outlier_law import Array, Outliers, Sample, bounds_of
 from gyrofuse.mismatch.stats.limits import Z
 
 _STEP, _LONGER = 0.15, 1.5  # of the way outwards: first, logarithm, and each next over the one before

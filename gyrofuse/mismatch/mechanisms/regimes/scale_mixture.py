@@ -7,13 +7,15 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
+from scipy import special
 from torch import Tensor
 
 from gyrofuse.mismatch.detectors.variance.haar_kurtosis import jump_test
+from gyrofuse.mismatch.detectors.variance.level_spread import level_lasts
 from gyrofuse.mismatch.detectors.variance.normality import gaussian_sensors
 from gyrofuse.mismatch.detectors.variance.outliers import spike_p_value
-from gyrofuse.mismatch.likelihoods.outlier_law import heavy_tailed
-from gyrofuse.mismatch.likelihoods.two_levels import TwoLevels
+from gyrofuse.mismatch.likelihoods.laws.heavy_tails import heavy_tailed
+from gyrofuse.mismatch.likelihoods.laws.two_levels import TwoLevels
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
@@ -22,19 +24,6 @@ from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples, held_out_blocks
 from gyrofuse.mismatch.signals.prediction_errors import left_out, scaled_innovations
 from gyrofuse.mismatch.stats.limits import Z
-
-
-def _lasts(z: Tensor) -> bool:
-    """Whether the level of values `(time,)` lasts over neighbouring samples, as in episodes: then it is none of these.
-
-    By the correlations of the log moduli, which outliers hardly move, at distances of 1 to 9 samples: of one of them,
-    or of all together, as where jumps or knocks take some samples each.
-    """
-    log_size = z.abs().clamp(min=1e-3 * float(z.abs().median())).log()
-    log_size = log_size - log_size.mean()
-    lags = [float((log_size[k:] * log_size[:-k]).mean() / log_size.square().mean()) for k in range(1, 10)]
-    n, one, all_of_them = len(z), 0.1, 0.02  # a tenth: less than a seventh of the samples would last
-    return max(lags) > max(one, 4 / math.sqrt(n)) or sum(lags) / 9 > max(all_of_them, 4 / math.sqrt(9 * n))
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +41,7 @@ class ScaleMixture(Mechanism):
 
     name: ClassVar[str] = "scale_mixture"
     likelihood: ClassVar[str] = "innovations"
-    rivals: ClassVar[tuple[str, ...]] = ("variance_change",)
+    rivals: ClassVar[tuple[str, ...]] = ("variance_change", "nonlinearity")
     separated_by: ClassVar[str] = "a longer recording, or the converter's raw words"
     share: OfSensors
     ratio: OfSensors
@@ -60,11 +49,14 @@ class ScaleMixture(Mechanism):
     @classmethod
     def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
         p_value = min(2 * min(spike_p_value(comparison), jump_test(comparison).p_value), 1.0)
-        if p_value > level or not bool(gaussian_sensors(comparison.reference).all()):
+        if p_value > level:
             return None
         z = left_out(comparison.observed).white[0]
         laws = [TwoLevels.fitted(row) for row in z]
-        gains = [float(law.gains(row).sum()) for law, row in zip(laws, z, strict=True)]
+        gains = [
+            float((law.gains(row) - _simulated(comparison, i, row)).sum())
+            for i, (law, row) in enumerate(zip(laws, z, strict=True))
+        ]
         rare = 0.03  # rarer ones are isolated outliers
         better, present = 10.0, 15.0  # nats over another heavy-tailed law, and over normal noise
         hit = tuple(
@@ -72,7 +64,7 @@ class ScaleMixture(Mechanism):
             for i, (law, gain) in enumerate(zip(laws, gains, strict=True))
             if gain > present and rare < law.share < 1 - rare and gain > heavy_tailed(z[i][law.within(z[i])]) + better
         )
-        if not hit or any(_lasts(z[i]) for i in hit):
+        if not hit or any(level_lasts(z[i]) for i in hit):
             return None
         info, parameters = comparison.info, {}
         share, ratio = torch.zeros(2, comparison.n_sensors, dtype=torch.float64)
@@ -81,9 +73,9 @@ class ScaleMixture(Mechanism):
             share[i], ratio[i] = law.share, law.large / law.small
             odds_sd, ratio_sd = law.standard_deviations(z[i])
             odds = math.log(law.share / (1 - law.share))
-            low, high = (100 / (1 + math.exp(-odds - sign * Z * odds_sd)) for sign in (-1, 1))
+            low, high = (100 * float(special.expit(odds + sign * Z * odds_sd)) for sign in (-1, 1))
             parameters[f"share[{i}]"] = Parameter(100 * law.share, low, high, "%")
-            reach = math.exp(Z * ratio_sd)
+            reach = math.exp(min(Z * ratio_sd, 50.0))
             value = float(ratio[i])
             parameters[f"ratio[{i}]"] = Parameter.within(value, reach, "")
         largest = max(hit, key=lambda i: gains[i])
@@ -109,15 +101,12 @@ class ScaleMixture(Mechanism):
         return replace(self, share=torch.where(has, share, 0.0), ratio=torch.where(has, ratio, 1.0))
 
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
-        gaussian, rows = gaussian_sensors(comparison.reference), []
-        simulated = left_out(comparison.reference).white.movedim(0, 1).flatten(1)
+        rows = []
         for i, row in enumerate(left_out(comparison.observed).white[0]):
             share, ratio = float(self.share[i]), float(self.ratio[i])
             small = float(row.square().mean().sqrt()) / math.sqrt(1 - share + share * ratio**2)
-            gains = TwoLevels(share, small, ratio * small).gains(row) if share else torch.zeros_like(row)
-            if share and not bool(gaussian[i]):  # what else was found may make such values as well
-                gains = gains - TwoLevels.fitted(simulated[i]).gains(row)
-            rows.append(gains)
+            law = TwoLevels(share, small, ratio * small)
+            rows.append(law.gains(row) - _simulated(comparison, i, row) if share else torch.zeros_like(row))
         return held_out_blocks(torch.stack(rows), fold).sum((0, -1))
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
@@ -132,3 +121,11 @@ class ScaleMixture(Mechanism):
 
     def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         pictures.tails(ax, comparison, sensor)
+
+
+def _simulated(comparison: Comparison, sensor: int, row: Tensor) -> Tensor:
+    """What the law of a sensor's simulation gains in values `(time,)`: what else was found may make them as well."""
+    if bool(gaussian_sensors(comparison.reference)[sensor]):
+        return torch.zeros_like(row)
+    law = TwoLevels.fitted(left_out(comparison.reference).white[:, sensor].flatten())
+    return law.scaled_to(row[law.within(row)]).gains(row)

@@ -13,18 +13,18 @@ from gyrofuse.mismatch.detectors.variance.noise_level import whitened_recording
 from gyrofuse.mismatch.detectors.variance.normality import gaussian_sensors
 from gyrofuse.mismatch.detectors.variance.outliers import likely_outliers, spike_p_value, spike_p_values
 from gyrofuse.mismatch.detectors.variance.weak_outliers import WeakOutliers
-from gyrofuse.mismatch.likelihoods.outlier_law import (
+from gyrofuse.mismatch.likelihoods.laws.heavy_tails import heavy_tailed
+from gyrofuse.mismatch.likelihoods.laws.outlier_law import (
     Outliers,
     clustered,
     fitted,
     fitted_shock,
     free_gaussian,
-    heavy_tailed,
     mixture,
     shock_posterior,
     shock_scores,
 )
-from gyrofuse.mismatch.likelihoods.two_levels import TwoLevels
+from gyrofuse.mismatch.likelihoods.laws.two_levels import TwoLevels
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
@@ -54,7 +54,7 @@ class Spikes(Mechanism):
 
     Looks like white noise; the tails of what is left of a sample when all others have spoken tell them apart. Loud
     episodes have such tails too, but their outliers lie together. Noise that is heavy-tailed throughout has more of the
-    small ones than a few spikes leave: it is none of these, and has no name here.
+    small ones than a few spikes leave: that is another law of the noise.
 
     Attributes:
         rate: Of spikes, for a sample, `(sensor,)`; 0 where there are none.

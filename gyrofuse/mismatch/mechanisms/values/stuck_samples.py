@@ -16,7 +16,7 @@ from gyrofuse.mismatch.detectors.values.values import repeats, repeats_so_far
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
-from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
+from gyrofuse.mismatch.mechanisms.values.rounding.dead_band import DeadBand
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples, held_out_blocks

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy import optimize, special, stats
+from scipy import optimize, special
 from torch import Tensor
 
 from gyrofuse.mismatch.stats.limits import Z
@@ -189,42 +189,6 @@ def _minimised(
 ) -> optimize.OptimizeResult:
     """The least of a function, which gives its slopes as well or has them taken by differences."""
     return optimize.minimize(deviance, start, method="L-BFGS-B", jac=slopes, bounds=bounds, options={"maxiter": 60})
-
-
-def heavy_tailed(z: Tensor) -> float:
-    """Log likelihood ratio of noise that is heavy-tailed throughout to a normal law, of its own variance each, nats.
-
-    The better of Student's law and of a normal plus a Laplace variable, scale and shape fitted.
-    """
-    sample = Sample(z)
-    x, weight = sample.values.numpy(), sample.counts.numpy()
-    variance = (sample.counts * sample.values.square()).sum() / sample.n
-    plain = float((sample.counts * gaussian(sample.values, variance)).sum())
-
-    def gain(law: _Law, start: tuple[float, float], bounds: list[tuple[float, float]]) -> float:
-        run = _minimised(
-            lambda theta: -float((weight * law(x, *np.exp(theta))).sum()),
-            np.log(start).tolist(),
-            [(math.log(low), math.log(high)) for low, high in bounds],
-        )
-        return -float(run.fun) - plain
-
-    return max(
-        gain(_student, (20.0, 1.0), [(2.1, 1e4), (0.3, 2.0)]),
-        gain(_normal_laplace, (0.3, 0.95), [(0.02, 2.0), (0.05, 2.0)]),
-    )
-
-
-def _student(z: Array, freedom: float, scale: float) -> Array:
-    """Log density of `scale` times a Student variable."""
-    return np.asarray(stats.t.logpdf(z / scale, freedom)) - math.log(scale)
-
-
-def _normal_laplace(z: Array, width: float, sd: float) -> Array:
-    """Log density of `sd` times a normal plus `width` times a Laplace variable."""
-    r = sd / width
-    up, down = -z / width + special.log_ndtr(z / sd - r), z / width + special.log_ndtr(-z / sd - r)
-    return np.asarray(np.logaddexp(up, down)) + r * r / 2 - math.log(2 * width)
 
 
 def clustered(white: Tensor) -> bool:

@@ -10,7 +10,7 @@ import torch
 from scipy import special
 from torch import Tensor
 
-from gyrofuse.mismatch.likelihoods.outlier_law import gaussian
+from gyrofuse.mismatch.likelihoods.laws.outlier_law import gaussian
 from gyrofuse.mismatch.signals.prediction_errors import median_sd
 
 
@@ -73,6 +73,16 @@ class TwoLevels(NamedTuple):
             last, law = law, cls(share, *sds)
             if abs(math.log(law.share / last.share)) + abs(math.log(law.large / last.large)) < 1e-7:
                 break
+        return law
+
+    def scaled_to(self, z: Tensor) -> TwoLevels:
+        """The same share and ratio with the likeliest scale of values `(time,)`."""
+        law, rounds = self, 50
+        for _ in range(rounds if self.share else 0):
+            small, large = law.log_densities(z)
+            hit = torch.sigmoid(large - small)
+            square = ((1 - hit) * (z / law.small).square() + hit * (z / law.large).square()).mean()
+            law = law._replace(small=law.small * float(square.sqrt()), large=law.large * float(square.sqrt()))
         return law
 
     def standard_deviations(self, z: Tensor) -> tuple[float, float]:
