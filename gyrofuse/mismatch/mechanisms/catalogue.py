@@ -59,6 +59,7 @@ from gyrofuse.mismatch.mechanisms.spectra.notch import NotchFilter
 from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
 from gyrofuse.mismatch.mechanisms.transients.channel_tone import ChannelTone
 from gyrofuse.mismatch.mechanisms.transients.chirp import Chirp
+from gyrofuse.mismatch.mechanisms.transients.modulated_tone import ModulatedTone
 from gyrofuse.mismatch.mechanisms.transients.pulses import Pulses
 from gyrofuse.mismatch.mechanisms.transients.ring_down import RingDown
 from gyrofuse.mismatch.mechanisms.transients.tone_in_spells import ToneInSpells
@@ -97,7 +98,7 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (Chirp,),  # which passes any frequency
     (RingDown, Pulses),  # whose strongest are lines too
     (WanderingHarmonics,),  # each of whose lines alone looks like several tones, or like noise that changes
-    (VibrationTone, ToneInSpells, ToneSize, Interleaving),
+    (VibrationTone, ModulatedTone, ToneInSpells, ToneSize, Interleaving),
     (RandomTelegraph,),
     (ChannelNoise, GradualChange),  # where noise is louder, what is slow is known less well
     (TemperatureDrift, WarmUpTransient, LateWarmUp, Ramp, Step, BiasOscillation),

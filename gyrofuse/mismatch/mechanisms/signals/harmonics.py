@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
+from scipy import special
 from torch import Tensor
 
 from gyrofuse._base.transforms import squared_modulus
@@ -54,18 +55,17 @@ def harmonics_of(comparison: Comparison, f: float, sd: float) -> Harmonics:
     for multiple in multiples_of_it:
         reach = 0.25 / comparison.n_samples / max(sd / multiple, 1e-12)
         others = [k for k in range(1, min(most, int(reach)) + 1) if k != multiple]
-        found.append(Harmonics(multiple, _seen(comparison, f / multiple, f, others)))
+        found.append(Harmonics(multiple, _seen(comparison, f, [(k, k * f / multiple) for k in others])))
     # A fundamental is divided only where that tells of more lines.
     return max(found, key=lambda one: (len(one.others), -one.multiple))
 
 
-def _seen(comparison: Comparison, fundamental: float, line: float, multiples: Sequence[int]) -> tuple[int, ...]:
-    """Those of some multiples at which the recording has a line of its own."""
+def _seen(comparison: Comparison, line: float, wanted: Sequence[tuple[int, float]]) -> tuple[int, ...]:
+    """Those numbers at whose frequencies the recording has a line, beside one and those of the simulation."""
     n, certain = comparison.n_samples, 1e-4
-    known = [line, *simulated_lines(comparison.reference)]
-    taken, places = list(known), list[tuple[int, float]]()
-    for k in multiples:
-        place = float(folded(torch.tensor(k * fundamental, dtype=torch.float64)))
+    taken, places = [line, *simulated_lines(comparison.reference)], list[tuple[int, float]]()
+    for k, f in wanted:
+        place = float(folded(torch.tensor(f, dtype=torch.float64)))
         inside = 10 / n < place < 0.5 - (GUARD + 1) / n
         if inside and all(abs(place - other) > 2 * GUARD / n for other in taken):
             places.append((k, place))
@@ -75,10 +75,76 @@ def _seen(comparison: Comparison, fundamental: float, line: float, multiples: Se
     at = torch.tensor([place for _, place in places], dtype=torch.float64)
     each = CHANCE / (3 * len(places))
     lines = torch.tensor(taken, dtype=torch.float64)
-    lines = torch.tensor(taken, dtype=torch.float64)
     sure = _beside_few(comparison, at, lines) < certain * each
     seen = (sure | (_beside_many(comparison, at, lines) < each)) if int(sure.sum()) > 1 else sure
     return tuple(k for (k, _), yes in zip(places, seen.tolist(), strict=True) if yes)
+
+
+class Sidebands(NamedTuple):
+    """Lines evenly beside one.
+
+    Attributes:
+        spacing: Cycles per sample.
+        orders: Of the lines, by how many spacings they are off: all but zero.
+    """
+
+    spacing: float
+    orders: tuple[int, ...]
+
+
+def sidebands_of(comparison: Comparison, f: float) -> Sidebands | None:
+    """Lines evenly beside a line, as of a tone whose size or frequency goes up and down; None without any.
+
+    Of all distances of the lines nearby, and their halves and thirds, the one at whose multiples the most unlikely
+    number of lines is found: one of chance is near a multiple with twice the tolerance over the spacing.
+    """
+    least, tolerance = 2 * GUARD + 2, 0.5  # bins
+    off = _lines_near(comparison, f) * comparison.n_samples
+    tried = torch.cat([off.abs() / k for k in (1, 2, 3)])
+    tried = tried[tried > least]
+    if len(off) < 2 or not len(tried):
+        return None
+    orders = (off / tried[:, None]).round()
+    on = ((off - orders * tried[:, None]).abs() < tolerance) & (orders != 0)
+    # The line that a spacing was taken from says nothing for it.
+    surprise = (on.sum(-1) - 1) * (tried / (2 * tolerance)).log() - math.log(len(tried))
+    best = int(surprise.argmax())
+    if float(surprise[best]) < -math.log(CHANCE):
+        return None
+    order, place = orders[best][on[best]], off[on[best]]
+    spacing = float((order @ place) / (order @ order)) / comparison.n_samples
+    most = 2 * int(order.abs().max())
+    wanted = [(k, f + k * spacing) for k in sorted(range(-most, most + 1), key=abs) if k]
+    found = _seen(comparison, f, wanted)
+    return Sidebands(spacing, found) if len(found) > 1 else None
+
+
+def _lines_near(comparison: Comparison, f: float) -> Tensor:
+    """How far other lines are from one, cycles per sample: local maxima far above the noise, a few at most."""
+    reach, level, rare, most = 4096, 129, 1e-6, 24  # bins, and lines
+    transform, length = tapered(comparison.observed)
+    finer, n, p = length / comparison.n_samples, comparison.n_samples, comparison.n_sensors
+    first = max(round(f * length) - int(reach * finer), int(10 * finer))
+    last = min(round(f * length) + int(reach * finer), length // 2 - int(4 * finer))
+    place = torch.arange(first, last + 1, dtype=torch.float64) / length
+    power = (squared_modulus(transform[:, first : last + 1]) / comparison.base.spectrum(place)).sum(0)
+    if len(power) < 2 * level:
+        return torch.zeros(0, dtype=torch.float64)
+    padded = torch.nn.functional.pad(power[None], (level // 2, level // 2), mode="reflect")[0]
+    noise = padded.unfold(0, level, 1).median(-1).values / float(special.gammaincinv(p, 0.5))
+    chance = torch.special.gammaincc(torch.tensor(float(p), dtype=torch.float64), power / noise)
+    guard = 2 * int(GUARD * finer) + 1
+    highest = torch.nn.functional.max_pool1d(power[None], guard, 1, guard // 2)[0] == power
+    peaks = (highest & (chance < rare) & ((place - f).abs() > 2 * GUARD / n)).nonzero()[:, 0]
+    peaks = peaks[power[peaks].argsort(descending=True)[:most]]
+    # Between bins: the vertex of a parabola through the logarithms.
+    inner = peaks.clamp(1, len(power) - 2)
+    low, middle, high = (power[inner + k].log() for k in (-1, 0, 1))
+    vertex = ((low - high) / (2 * (low - 2 * middle + high)).clamp(max=-1e-9)).clamp(-0.5, 0.5)
+    known = torch.tensor(simulated_lines(comparison.reference), dtype=torch.float64)
+    at = place[inner] + vertex / length
+    ours = ((at[:, None] - known).abs() > 2 * GUARD / n).all(-1)
+    return (at - f)[ours]
 
 
 def _beside_few(comparison: Comparison, places: Tensor, lines: Tensor) -> Tensor:

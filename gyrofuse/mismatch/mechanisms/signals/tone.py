@@ -78,27 +78,29 @@ class VibrationTone(Mechanism):
         line = comparison.line
         if line.p_value > level:
             return None
-        tone = cls.at(comparison, line.frequency * comparison.info.rate)
+        tone = VibrationTone.at(comparison, line.frequency * comparison.info.rate)
         sd = tone._sd(comparison)
-        spread = tone._frequency_sd(comparison, sd)
-        series = harmonics_of(comparison, tone.frequency_hz / comparison.info.rate, spread)
-        if series.others:
-            tone = tone.with_harmonics(comparison, series)
-            sd = tone._sd(comparison)
-            spread = tone._frequency_sd(comparison, sd)
+        family = cls._with_family(comparison, tone, float(tone._frequency_sds(comparison, sd)[0]))
+        if family is None:
+            return None
+        tone, sd = family, family._sd(comparison)
+        spreads = tone._frequency_sds(comparison, sd) * comparison.info.rate
         squares = tone._squares(sd)
         snr = squares[0].sqrt()
         there = included_sensors(squares[0], 2)
-        seen, certain, most_told = math.sqrt(there.least), 30.0, 6  # square of a harmonic; harmonics with limits
-        present = tuple((there.which | (squares[1:] > certain).any(0)).nonzero()[:, 0].tolist())
-        parameters = {"frequency": _limits(tone.frequency_hz, spread * comparison.info.rate, "Hz")}
+        seen, most_told = math.sqrt(there.least), 6  # harmonics with limits
+        present = tuple(tone._has(squares).nonzero()[:, 0].tolist())
+        parameters = {
+            name: _limits(value, sd, "Hz")
+            for (name, value), sd in zip(tone._frequencies().items(), spreads.tolist(), strict=True)
+        }
         low, value, high = sd[0, list(present)] * amplitude_limits(snr[list(present)], seen)
         for row in zip(present, value.tolist(), low.tolist(), high.tolist(), strict=True):
             parameters[f"amplitude[{row[0]}]"] = Parameter(*row[1:], comparison.info.measure)
         for k in sorted((squares[1:].amax(-1).argsort(descending=True)[:most_told] + 1).tolist()):
             harmonic, i = tone.harmonics[k - 1], int(squares[k].argmax())
             size, reach = float(torch.hypot(harmonic.cosine[i], harmonic.sine[i])), Z * float(sd[k, i])
-            parameters[f"harmonic_{harmonic.multiple}[{i}]"] = Parameter.around(size, reach, comparison.info.measure)
+            parameters[f"{tone._word(harmonic)}[{i}]"] = Parameter.around(size, reach, comparison.info.measure)
         largest = max(present, key=lambda i: parameters[f"amplitude[{i}]"].value)
         info = comparison.info
         where = info.named(present, "all sensors")
@@ -129,22 +131,59 @@ class VibrationTone(Mechanism):
             "those above half the rate are seen folded"
         )
 
-    def _frequency_sd(self, comparison: Comparison, sd: Tensor) -> float:
-        """Standard deviation of its frequency, by the noise and a phase that walks, cycles per sample.
+    @classmethod
+    def _with_family(cls, comparison: Comparison, tone: VibrationTone, spread: float) -> VibrationTone | None:
+        """A tone with lines that go along with it; None of what is nothing without them.
 
         Args:
             comparison: Recording and simulation.
-            sd: Of the amplitudes, `(1 + harmonic, sensor)`.
+            tone: The line by itself.
+            spread: Standard deviation of its frequency, cycles per sample.
+        """
+        series = harmonics_of(comparison, tone.frequency_hz / comparison.info.rate, spread)
+        return tone.with_harmonics(comparison, series) if series.others else tone
+
+    def _has(self, squares: Tensor) -> Tensor:
+        """Which sensors have it, by squares of amplitudes `(line, sensor)`."""
+        certain = 30.0  # of a harmonic
+        return included_sensors(squares[0], 2).which | (squares[1:] > certain).any(0)
+
+    @staticmethod
+    def _word(one: Harmonic) -> str:
+        """Name of the amplitude of another line."""
+        return f"harmonic_{one.multiple}"
+
+    def _frequencies(self) -> dict[str, float]:
+        """Those that are free, by the names of their parameters, Hz."""
+        return {"frequency": self.frequency_hz}
+
+    def _at_frequencies(self, hz: list[float]) -> VibrationTone:
+        """The same with others in their place."""
+        return replace(self, frequency_hz=hz[0])
+
+    def _turns(self) -> Tensor:
+        """How many times as fast as each of them the lines turn, `(frequency, line)`, its own first."""
+        return torch.tensor([[1.0, *(one.multiple / self.multiple for one in self.harmonics)]], dtype=torch.float64)
+
+    def _frequency_sds(self, comparison: Comparison, sd: Tensor) -> Tensor:
+        """Sds of its frequencies, by the noise and a phase that walks, cycles per sample `(frequency,)`.
+
+        Args:
+            comparison: Recording and simulation.
+            sd: Of the amplitudes, `(line, sensor)`.
         """
         squares = self._squares(sd)
         present = included_sensors(squares[0], 2).which
         # Noise adds to the squares of amplitudes, but has no information on the frequency.
         squares = (squares - 2).clamp(min=0.0)
         own = max(float(squares[0, present].sum()), 1.0)
-        ratios = torch.tensor([h.multiple / self.multiple for h in self.harmonics], dtype=torch.float64)
-        energy = own + float((ratios.square()[:, None] * squares[1:]).sum())
+        energy, turns = torch.cat([torch.tensor([own], dtype=sd.dtype), squares[1:].sum(-1)]), self._turns()
+        information = (turns * energy) @ turns.mT
         n, noise = comparison.n_samples, sd[0].square() * comparison.n_samples / 2
-        return math.hypot(math.sqrt(12 / energy) / (2 * math.pi * n), self.wander(comparison, noise, own))
+        by_noise = (12 * torch.linalg.inv(information).diagonal()).sqrt() / (2 * math.pi * n)
+        wander = torch.zeros_like(by_noise)
+        wander[0] = self.wander(comparison, noise, own)
+        return torch.hypot(by_noise, wander)
 
     def _sd(self, comparison: Comparison) -> Tensor:
         """Standard deviation of each amplitude, `(1 + harmonic, sensor)`."""
@@ -152,8 +191,7 @@ class VibrationTone(Mechanism):
 
     def _squares(self, sd: Tensor) -> Tensor:
         """Squares of amplitudes over their variances, `(1 + harmonic, sensor)`."""
-        parts = torch.stack([torch.hypot(cosine, sine) for _, cosine, sine in self._parts()])
-        return (parts / sd).square()
+        return (torch.hypot(*self._parts()) / sd).square()
 
     def _densities(self, comparison: Comparison) -> Tensor:
         """Noise of the recording around each line, without that itself, per sample `(1 + harmonic, sensor)`."""
@@ -161,15 +199,20 @@ class VibrationTone(Mechanism):
         places = torch.tensor(self._places(comparison.info), dtype=torch.float64)
         return squared_modulus(surroundings(comparison, places, reach)[0]).nanmean(-1).mT
 
-    def _parts(self) -> list[tuple[float, Tensor, Tensor]]:
-        """Its own and those of its harmonics: multiples of its frequency, cosines and sines."""
-        own = [(1.0, self.cosine, self.sine)]
-        return own + [(one.multiple / self.multiple, one.cosine, one.sine) for one in self.harmonics]
+    def _parts(self) -> tuple[Tensor, Tensor]:
+        """Cosines and sines of its own line and of the others, `(line, sensor)`."""
+        return (
+            torch.stack([self.cosine, *(one.cosine for one in self.harmonics)]),
+            torch.stack([self.sine, *(one.sine for one in self.harmonics)]),
+        )
+
+    def _lines_hz(self) -> Tensor:
+        """Frequencies of these, `(line,)`, not folded."""
+        return torch.tensor(list(self._frequencies().values()), dtype=torch.float64) @ self._turns()
 
     def _places(self, info: RecordingInfo) -> list[float]:
         """Where these are seen, cycles per sample."""
-        ratios = torch.tensor([ratio for ratio, _, _ in self._parts()], dtype=torch.float64)
-        return folded(ratios * self.frequency_hz / info.rate).tolist()
+        return folded(self._lines_hz() / info.rate).tolist()
 
     def with_harmonics(self, comparison: Comparison, series: Harmonics) -> VibrationTone:
         """The same with lines at multiples of a fundamental frequency."""
@@ -243,42 +286,41 @@ class VibrationTone(Mechanism):
         return cls(frequency_hz, none, none)._fitted(comparison, keep)
 
     def _fitted(self, comparison: Comparison, keep: Tensor) -> VibrationTone:
-        """Frequency and amplitudes by least squares on samples to keep, from where the frequency stands."""
+        """Frequencies and amplitudes by least squares on samples to keep, from where the frequencies stand."""
         stretch, rate = 2**18, comparison.info.rate  # samples at a time
-        ratios = torch.tensor([ratio for ratio, _, _ in self._parts()], dtype=torch.float64)
-        weights = 1 / self._densities(comparison)
+        turns, weights = self._turns(), 1 / self._densities(comparison)
         t = torch.arange(comparison.n_samples, dtype=torch.float64)[keep]
         signal = comparison.recording[:, keep]
         signal = signal - signal.mean(-1, keepdim=True)
-        span, m = float(t[-1] - t[0]) + 1, len(ratios)
-        omega, middle = 2 * math.pi * self.frequency_hz / rate, t.mean()
+        span, m, middle = float(t[-1] - t[0]) + 1, turns.shape[-1], t.mean()
+        free = 2 * math.pi / rate * torch.tensor(list(self._frequencies().values()), dtype=torch.float64)
         for _ in range(6):
             gram = torch.zeros(4 * m, 4 * m, dtype=torch.float64)
             seen = torch.zeros(4 * m, len(signal), dtype=torch.float64)
             for part, times in zip(signal.split(stretch, -1), t.split(stretch), strict=True):
-                angle = omega * ratios[:, None] * times
+                angle = (free @ turns)[:, None] * times
                 tones = torch.cat([angle.cos(), angle.sin()])
                 basis = torch.cat([tones, (times - middle) / span * tones])
                 gram, seen = gram + basis @ basis.mT, seen + basis @ part.mT
-            gram = gram + 1e-12 * gram.trace() * torch.eye(
-                4 * m, dtype=gram.dtype
-            )  # next to half the rate sines vanish
+            # Next to half the rate sines vanish.
+            gram = gram + 1e-12 * gram.trace() * torch.eye(4 * m, dtype=gram.dtype)
             at = torch.linalg.solve(gram[: 2 * m, : 2 * m], seen[: 2 * m])  # (cosines then sines, sensor)
-            # Of the phases, on the clock: each multiple turns as many times as fast.
-            slope = ratios.repeat(2)[:, None] * torch.cat([at[m:], -at[:m]])
-            slope = torch.cat([-torch.linalg.solve(gram[: 2 * m, : 2 * m], gram[: 2 * m, 2 * m :] @ slope), slope])
+            # Of the phases, on the clock, for each frequency: lines turn as many times as fast.
+            slope = turns.repeat(1, 2)[..., None] * torch.cat([at[m:], -at[:m]])  # (frequency, line, sensor)
+            with_it = torch.linalg.solve(gram[: 2 * m, : 2 * m], gram[: 2 * m, 2 * m :] @ slope)
+            slope = torch.cat([-with_it, slope], 1)
             left = seen - gram[:, : 2 * m] @ at
-            each = weights.repeat(4, 1)
-            step = (each * slope * left).sum() / (each * slope * (gram @ slope)).sum()
-            omega += float(step.clamp(-1.0, 1.0)) / span
+            each = weights.repeat(4, 1) * slope
+            downhill = (each * left).sum((-1, -2))
+            curvature = torch.einsum("kls,mls->km", each, gram @ slope)
+            free = free + torch.linalg.solve(curvature, downhill).clamp(-1.0, 1.0) / span
         cosines, sines = at[:m], at[m:]
         harmonics = tuple(
             replace(one, cosine=cosine, sine=sine)
             for one, cosine, sine in zip(self.harmonics, cosines[1:], sines[1:], strict=True)
         )
-        return replace(
-            self, frequency_hz=omega * rate / (2 * math.pi), cosine=cosines[0], sine=sines[0], harmonics=harmonics
-        )
+        found = replace(self, cosine=cosines[0], sine=sines[0], harmonics=harmonics)
+        return found._at_frequencies((free * rate / (2 * math.pi)).tolist())
 
     def fit_without(self, comparison: Comparison, fold: int) -> VibrationTone:
         return self._fitted(comparison, estimation_samples(comparison.n_samples, fold))
@@ -287,8 +329,8 @@ class VibrationTone(Mechanism):
         pictures.spectrum_near(ax, comparison, sensor, self.frequency_hz, comparison.info.rate / comparison.n_samples)
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
-        turn = 2 * math.pi * torch.rand((), generator=generator, dtype=torch.float64)
-        return signal + self._path(signal.shape[-1], info, float(turn))
+        turns = 2 * math.pi * torch.rand(len(self._frequencies()), generator=generator, dtype=torch.float64)
+        return signal + self._path(signal.shape[-1], info, turns)
 
     def remove(self, signal: Tensor, info: RecordingInfo) -> Tensor:
         return signal - self._path(signal.shape[-1], info)
@@ -301,11 +343,14 @@ class VibrationTone(Mechanism):
         built = self.apply_to_reference(comparison, generator)
         return built.knowing((*comparison.reference.lines, *self._places(comparison.info)))
 
-    def _path(self, n_samples: int, info: RecordingInfo, turn: float = 0.0) -> Tensor:
-        angle = 2 * math.pi * self.frequency_hz * info.seconds(n_samples) + turn * self.multiple
-        path = torch.zeros(len(self.cosine), n_samples, dtype=torch.float64)
-        for ratio, cosine, sine in self._parts():
-            path = path + cosine[:, None] * (ratio * angle).cos() + sine[:, None] * (ratio * angle).sin()
+    def _path(self, n_samples: int, info: RecordingInfo, turned: Tensor | None = None) -> Tensor:
+        """Its course, with the phases of its fundamental frequencies turned on."""
+        path, seconds = torch.zeros(len(self.cosine), n_samples, dtype=torch.float64), info.seconds(n_samples)
+        turns = self._turns()
+        on = torch.zeros(turns.shape[-1], dtype=torch.float64) if turned is None else (turned * self.multiple) @ turns
+        for f, start, cosine, sine in zip(self._lines_hz().tolist(), on.tolist(), *self._parts(), strict=True):
+            angle = 2 * math.pi * f * seconds + start
+            path = path + cosine[:, None] * angle.cos() + sine[:, None] * angle.sin()
         return path
 
 
