@@ -9,6 +9,7 @@ import math
 from dataclasses import replace
 
 import torch
+from scipy import special
 from torch import Tensor
 
 import gyrofuse as gf
@@ -33,7 +34,7 @@ from gyrofuse.mismatch.mechanisms.signals.quadratic_coupling import QuadraticCou
 from gyrofuse.mismatch.mechanisms.signals.scale_factor import ScaleFactor
 from gyrofuse.mismatch.mechanisms.signals.sensor_delay import SensorDelay
 from gyrofuse.mismatch.mechanisms.signals.time_scale import TimeScale
-from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
+from gyrofuse.mismatch.mechanisms.signals.tone import Harmonic, VibrationTone
 from gyrofuse.mismatch.mechanisms.signals.tone_amplitude import ToneSize
 from gyrofuse.mismatch.mechanisms.simulated.course import SimulatedCourse, SimulatedRamp, SimulatedStep, SimulatedWarmUp
 from gyrofuse.mismatch.mechanisms.simulated.noise import (
@@ -66,11 +67,13 @@ from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
 from gyrofuse.mismatch.mechanisms.transients.channel_line import ChannelLine
 from gyrofuse.mismatch.mechanisms.transients.channel_tone import ChannelTone
 from gyrofuse.mismatch.mechanisms.transients.chirp import Chirp
+from gyrofuse.mismatch.mechanisms.transients.modulated_tone import ModulatedTone
 from gyrofuse.mismatch.mechanisms.transients.pulses import Pulses
 from gyrofuse.mismatch.mechanisms.transients.ring_down import RingDown
 from gyrofuse.mismatch.mechanisms.transients.tone_in_spells import ToneInSpells
 from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.values.held_values import HeldValues
+from gyrofuse.mismatch.mechanisms.values.interleaved_gain import InterleavedGain
 from gyrofuse.mismatch.mechanisms.values.interleaving import Interleaving
 from gyrofuse.mismatch.mechanisms.values.interpolated_samples import InterpolatedSamples
 from gyrofuse.mismatch.mechanisms.values.median_filter import MedianFilter
@@ -358,6 +361,13 @@ def _(setting: Setting) -> Drawn:
     return Drawn(Interleaving(offset), setting.of_each("offset", offset))
 
 
+@draws(InterleavedGain)
+def _(setting: Setting) -> Drawn:
+    ratio = setting.sizes(0.15, 0.3).mul(min(setting.size, 4.0)).exp()
+    effect = InterleavedGain(torch.ones_like(ratio), ratio, setting.clean.mean(-1))
+    return Drawn(effect, setting.of_each("gain_ratio", torch.where(ratio != 1, ratio, 0.0)))
+
+
 @draws(ChannelCoupling)
 def _(setting: Setting) -> Drawn:
     gain = setting.signed(0.25, 0.4) * setting.size
@@ -457,6 +467,19 @@ def _(setting: Setting) -> Drawn:
     turn = torch.tensor([setting.even(0, 6) for _ in size], dtype=torch.float64)
     effect = VibrationTone(f, size * turn.cos(), size * turn.sin())
     return Drawn(effect, {"frequency": f, **setting.of_each("amplitude", size)})
+
+
+@draws(ModulatedTone)
+def _(setting: Setting) -> Drawn:
+    """Of a frequency that follows a sine: amplitudes are Bessel functions of its turn."""
+    f, slow, turn = setting.even(10, 40), setting.even(0.3, 0.9), setting.even(1.5, 2.2)
+    size = setting.sizes(0.5, 0.7) * setting.size
+    phase = setting.even(0, 6)
+    sizes = {k: size * float(special.jv(k, turn)) for k in range(-3, 4)}
+    lines = {k: (a * math.cos(k * phase), -a * math.sin(k * phase)) for k, a in sizes.items()}
+    own = lines.pop(0)
+    effect = ModulatedTone(f, *own, harmonics=tuple(Harmonic(k, *a) for k, a in lines.items()), modulation_hz=slow)
+    return Drawn(effect, {"frequency": f, "modulation": slow, **setting.of_each("amplitude", own[0].abs())})
 
 
 @draws(ToneSize)

@@ -68,11 +68,13 @@ from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
 from gyrofuse.mismatch.mechanisms.transients.channel_line import ChannelLine
 from gyrofuse.mismatch.mechanisms.transients.channel_tone import ChannelTone
 from gyrofuse.mismatch.mechanisms.transients.chirp import Chirp
+from gyrofuse.mismatch.mechanisms.transients.modulated_tone import ModulatedTone
 from gyrofuse.mismatch.mechanisms.transients.pulses import Pulses
 from gyrofuse.mismatch.mechanisms.transients.ring_down import RingDown
 from gyrofuse.mismatch.mechanisms.transients.tone_in_spells import ToneInSpells
 from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.values.held_values import HeldValues
+from gyrofuse.mismatch.mechanisms.values.interleaved_gain import InterleavedGain
 from gyrofuse.mismatch.mechanisms.values.interleaving import Interleaving
 from gyrofuse.mismatch.mechanisms.values.interpolated_samples import InterpolatedSamples
 from gyrofuse.mismatch.mechanisms.values.median_filter import MedianFilter
@@ -187,6 +189,14 @@ EVERY = (
         torch.tensor([[1 / 3, 0.0], [0.1, 0.2]], dtype=torch.float64),
         torch.tensor([[0.1, 0.0], [1 / 7, 0.2]], dtype=torch.float64),
         10.0,
+    ),
+    InterleavedGain(numbers(1.0, 1.0), numbers(4 / 3, 1.0), numbers(0.1, 0.2)),
+    ModulatedTone(
+        12.5,
+        numbers(1 / 3, 0.0),
+        numbers(0.0, 0.1),
+        harmonics=(Harmonic(-1, numbers(0.1, 0.2), numbers(0.0, 1 / 3)),),
+        modulation_hz=2 / 3,
     ),
     VibrationTone(7.3, numbers(0.3, 0.0), numbers(0.1, 0.2)),
     VibrationTone(

@@ -65,6 +65,7 @@ from gyrofuse.mismatch.mechanisms.transients.ring_down import RingDown
 from gyrofuse.mismatch.mechanisms.transients.tone_in_spells import ToneInSpells
 from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.values.held_values import HeldValues
+from gyrofuse.mismatch.mechanisms.values.interleaved_gain import InterleavedGain
 from gyrofuse.mismatch.mechanisms.values.interleaving import Interleaving
 from gyrofuse.mismatch.mechanisms.values.interpolated_samples import InterpolatedSamples
 from gyrofuse.mismatch.mechanisms.values.median_filter import MedianFilter
@@ -85,7 +86,7 @@ def _stage_of(kind: type[Mechanism]) -> int:
 
 STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (SensorOrder,),  # whatever else is looked for sensor by sensor
-    (Nonlinearity,),  # which changes the level as well
+    (Nonlinearity, InterleavedGain),  # which change levels as well
     (UnitScale, SensorGain),
     # Facts on the numbers themselves.
     (AngleCounts,),  # whose values lie on a grid as rounded ones do

@@ -37,6 +37,25 @@ def harmonics(bench: Bench, nats: float) -> Part:
     return replace(part, form="harmonics")
 
 
+def modulated(bench: Bench, nats: float) -> Part:
+    """A tone whose frequency, or whose size, follows a sine: a controller that hunts, a beat."""
+    sensors = bench.some_sensors()
+    f, slow = bench.rng.uniform(0.1, 0.35) * bench.rate, bench.rng.uniform(15, 200) / bench.duration
+    t = np.arange(bench.steps) / bench.step_rate
+    swing = np.sin(2 * np.pi * slow * t + bench.rng.uniform(0, 2 * np.pi))
+    if bench.rng.integers(2):
+        phase, size = bench.rng.uniform(0.8, 6) * swing, np.ones_like(t)
+    else:
+        phase, size = np.zeros_like(t), 1 + bench.rng.uniform(0.3, 0.95) * swing
+    unit = np.zeros((bench.n_sensors, bench.n))
+    for i in sensors:
+        own = bench.rng.uniform(0, 2 * np.pi)
+        unit[i] = bench.rng.uniform(0.5, 1.5) * bench.sampled(size * np.cos(2 * np.pi * f * t + phase + own))
+    look_alikes = ("drifting_tone", "resonance")
+    part, _ = bench.shape("vibration_tone", nats, unit, frequency_hz=f, look_alikes=look_alikes)
+    return replace(part, form="modulated")
+
+
 def rotor(bench: Bench, nats: float) -> Part:
     """A rotor out of true whose speed wanders: lines in step at several multiples. Nats: of the spectra alone."""
     sensors = bench.some_sensors()

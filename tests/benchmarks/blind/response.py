@@ -1,4 +1,4 @@
-"""A response to rates that is no straight line: its size is worked out by simulation."""
+"""A response to rates that is no straight line, or another one at every second sample: sizes by simulation."""
 
 from __future__ import annotations
 
@@ -54,13 +54,10 @@ RESPONSES = {
 
 def nonlinearity(bench: Bench, nats: float) -> Part:
     """A scale that is bent; nats: the mean log likelihood ratio of what was felt, with the slope of the curve."""
-    sensors, n = list(bench.some_sensors(1)), bench.n
+    sensors = list(bench.some_sensors(1))
     form = str(bench.rng.choice(list(RESPONSES)))
     response = RESPONSES[form]
-    root = np.sqrt(bench.spectrum[sensors])
-    middle = bench.base.bias[sensors, None]
-    ordinates = bench.rng.standard_normal((len(sensors), n - 1)) * root
-    draws = idct(np.concatenate([np.zeros((len(sensors), 1)), ordinates], axis=1), norm="ortho", axis=-1)
+    middle, (draws, root) = bench.base.bias[sensors, None], _noise(bench, sensors)
     spread = draws.std(axis=1, keepdims=True)
 
     def ratio(y: Array, c: float) -> Array:
@@ -98,3 +95,45 @@ def nonlinearity(bench: Bench, nats: float) -> Part:
             "cubic": quantity(rms(cubic), "/(deg/s)^2", cubic),
         },
     )
+
+
+def interleaved_gain(bench: Bench, nats: float) -> Part:
+    """Two converters take turns, and the gain of one is off; nats: the mean log likelihood ratio without it."""
+    sensors = list(bench.some_sensors(1))
+    middle, (draws, root) = bench.base.bias[sensors, None], _noise(bench, sensors)
+    odd = np.arange(bench.n) % 2 == 1
+    sign = bench.rng.choice([-1.0, 1.0])
+
+    def factors(size: float) -> Array:
+        return np.where(odd, np.exp(sign * size), 1.0)
+
+    def ratio(y: Array, size: float) -> Array:
+        """Log likelihood ratio of what a sensor puts out, `(sensor, time)` -> `(sensor,)`."""
+        energies = [((coefficients(x) / root) ** 2).sum(axis=1) / 2 for x in (y, y / factors(size))]
+        return energies[0] - energies[1] - np.log(factors(size)).sum()
+
+    strength = solve(nats, lambda size: float(ratio(draws * factors(size), size).sum()), 1e-4, 1.5)
+
+    def convert(signal: Array) -> Array:
+        out = signal.copy()
+        out[sensors] = middle + (signal[sensors] - middle) * factors(strength)
+        return out
+
+    return Part(
+        "interleaving",
+        nats,
+        tuple(sensors),
+        lambda recording: float(ratio(recording[sensors] - middle, strength).sum()),
+        converter=convert,
+        oracle_law="bound",
+        sensor_nats=tuple(ratio(draws * factors(strength), strength).tolist()),
+        frequency_hz=bench.rate / 2,
+        parameters={"gain_ratio": quantity(float(np.exp(sign * strength)), "")},
+    )
+
+
+def _noise(bench: Bench, sensors: list[int]) -> tuple[Array, Array]:
+    """A draw of the noise of some sensors, and the root of its spectrum."""
+    root = np.sqrt(bench.spectrum[sensors])
+    ordinates = bench.rng.standard_normal((len(sensors), bench.n - 1)) * root
+    return idct(np.concatenate([np.zeros((len(sensors), 1)), ordinates], axis=1), norm="ortho", axis=-1), root

@@ -68,8 +68,28 @@ def _simulated(comparison: Comparison) -> Alternation:
     return _alternation(whitened(comparison.reference.signal[0], comparison.base))
 
 
+@derived
+def size_alternation(comparison: Comparison) -> Alternation:
+    """How every second sample is larger than the others: of the logarithms of moduli, beyond those of the simulation.
+
+    Of differences of every second sample, in which nothing slow is left; outliers hardly count.
+    """
+    own = _alternation(_log_sizes(comparison.recording))
+    simulated = _alternation(_log_sizes(comparison.reference.signal[0])).p_value
+    p_value = own.p_value if simulated > CHANCE else p_value_beyond_reference(own.p_value, simulated)
+    return own._replace(p_value=p_value)
+
+
+def _log_sizes(signal: Tensor) -> Tensor:
+    """Logarithms of moduli of differences of every second sample, without their mean, `(sensor, time - 2)`."""
+    least = 0.01  # of the mean modulus: values on a grid differ by nothing at times
+    size = (signal[:, 2:] - signal[:, :-2]).abs()
+    logs = size.maximum(least * size.mean(-1, keepdim=True)).clamp(min=1e-300).log()
+    return logs - logs.mean(-1, keepdim=True)
+
+
 def _alternation(white: Tensor) -> Alternation:
-    """Of whitened signals `(sensor, time)`."""
+    """Of signals `(sensor, time)` whose power is about the same next to half the rate."""
     n = white.shape[-1] // 2 * 2
     beside, guard = min(64, n // 8), 4  # bins
     taper = torch.hann_window(n, dtype=white.dtype)

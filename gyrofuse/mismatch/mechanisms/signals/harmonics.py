@@ -43,25 +43,32 @@ def folded(f: Tensor) -> Tensor:
 
 
 def harmonics_of(comparison: Comparison, f: float, sd: float) -> Harmonics:
-    """Lines of a recording at multiples of the frequency of one of them, or of a half or a third of that.
+    """Lines of a recording at multiples of the frequency of one of them, or of a part of that, down to an eighth.
 
     Args:
         comparison: Recording and simulation.
         f: Frequency of the line, cycles per sample.
         sd: Its standard deviation: a multiple counts as far as its place is known to a quarter of a bin.
     """
-    most, multiples_of_it = 128, (1, 2, 3)
+    most, parts = 128, 8  # of pulses that come again and again the strongest line is one of the first
     found = []
-    for multiple in multiples_of_it:
+    for multiple in range(1, parts + 1):
         reach = 0.25 / comparison.n_samples / max(sd / multiple, 1e-12)
         others = [k for k in range(1, min(most, int(reach)) + 1) if k != multiple]
-        found.append(Harmonics(multiple, _seen(comparison, f, [(k, k * f / multiple) for k in others])))
+        found.append(Harmonics(multiple, _seen(comparison, f, [(k, k * f / multiple) for k in others], parts)))
     # A fundamental is divided only where that tells of more lines.
     return max(found, key=lambda one: (len(one.others), -one.multiple))
 
 
-def _seen(comparison: Comparison, line: float, wanted: Sequence[tuple[int, float]]) -> tuple[int, ...]:
-    """Those numbers at whose frequencies the recording has a line, beside one and those of the simulation."""
+def _seen(comparison: Comparison, line: float, wanted: Sequence[tuple[int, float]], tried: int = 1) -> tuple[int, ...]:
+    """Those numbers at whose frequencies the recording has a line, beside one and those of the simulation.
+
+    Args:
+        comparison: Recording and simulation.
+        line: Frequency of that one, cycles per sample.
+        wanted: Numbers and frequencies.
+        tried: How many such sets are asked for.
+    """
     n, certain = comparison.n_samples, 1e-4
     taken, places = [line, *simulated_lines(comparison.reference)], list[tuple[int, float]]()
     for k, f in wanted:
@@ -73,7 +80,7 @@ def _seen(comparison: Comparison, line: float, wanted: Sequence[tuple[int, float
     if not places:
         return ()
     at = torch.tensor([place for _, place in places], dtype=torch.float64)
-    each = CHANCE / (3 * len(places))
+    each = CHANCE / (tried * len(places))
     lines = torch.tensor(taken, dtype=torch.float64)
     sure = _beside_few(comparison, at, lines) < certain * each
     seen = (sure | (_beside_many(comparison, at, lines) < each)) if int(sure.sum()) > 1 else sure
@@ -98,7 +105,7 @@ def sidebands_of(comparison: Comparison, f: float) -> Sidebands | None:
     Of all distances of the lines nearby, and their halves and thirds, the one at whose multiples the most unlikely
     number of lines is found: one of chance is near a multiple with twice the tolerance over the spacing.
     """
-    least, tolerance = 2 * GUARD + 2, 0.5  # bins
+    least, tolerance = 2 * GUARD + 2, 0.3  # bins
     off = _lines_near(comparison, f) * comparison.n_samples
     tried = torch.cat([off.abs() / k for k in (1, 2, 3)])
     tried = tried[tried > least]
