@@ -1,4 +1,4 @@
-"""Test of interleaved converters: every second sample is off, which is a line at half the rate.
+"""Test of interleaved converters: every second sample is off, which is a line at half the rate, or of another size.
 
 Statistic: the alternating mean of whitened samples of each sensor under a Hann taper, squared, over the mean power of
 the bins next to half the rate: without a taper, where a filter leaves nothing there, a record's ends would be all. Null
@@ -38,13 +38,15 @@ class Alternation(NamedTuple):
 
 
 def interleaving_test(comparison: Comparison) -> TestResult:
-    """Even and odd samples of different means, where the simulation has none."""
-    found = alternation(comparison)
+    """Even and odd samples of different means or sizes, where the simulation has none."""
+    p_values = interleaving_p_value(comparison), size_alternation(comparison).p_value
+    sized = p_values[1] < p_values[0]
+    found = size_alternation(comparison) if sized else alternation(comparison)
     sensors = included_sensors(found.square, 1).positions
     return TestResult(
         "interleaving",
-        interleaving_p_value(comparison),
-        f"even and odd samples have different means in {comparison.info.named(sensors)}",
+        sidak(min(p_values), len(p_values)),
+        f"even and odd samples have different {'sizes' if sized else 'means'} in {comparison.info.named(sensors)}",
         sensors=sensors,
         levels=(1,),
         frequency_hz=comparison.info.rate / 2,
