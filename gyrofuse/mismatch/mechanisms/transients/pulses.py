@@ -181,7 +181,13 @@ def _jointly(one: FittedPulse, shared: Tensor) -> float:
 
 
 def _is_one(around: Surroundings, one: FittedPulse, slow: float) -> bool:
-    """Whether no other course explains as much, nor a jump that decays over `slow` samples or more."""
+    """Whether no other course explains as much, nor a jump that decays over `slow` samples or more.
+
+    A level that stays for as long is one of the bias, between two steps.
+    """
+    flat = 0.1  # power of a half wave that is nearly a rectangle
+    if one.pulse.power < flat and one.pulse.width > slow:
+        return False
     there = sized(around, one.pulse, one.amplitude.nonzero()[:, 0].tolist())
     return float(there.log_ratio.sum()) > other_course(around, there, slow) + NATS_PER_NUMBER
 
