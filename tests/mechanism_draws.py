@@ -18,6 +18,7 @@ from gyrofuse.mismatch.likelihoods.spectra.filter_forms import filter_strength
 from gyrofuse.mismatch.mechanisms.regimes.channel_noise import ChannelNoise
 from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
 from gyrofuse.mismatch.mechanisms.regimes.heavy_tails import HeavyTailedNoise
+from gyrofuse.mismatch.mechanisms.regimes.periodic_noise import PeriodicNoise
 from gyrofuse.mismatch.mechanisms.regimes.scale_mixture import ScaleMixture
 from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
 from gyrofuse.mismatch.mechanisms.regimes.telegraph import RandomTelegraph
@@ -276,6 +277,17 @@ def _(setting: Setting) -> Drawn:
     factor = setting.sizes(1.7, 2.2, 1.0) ** min(setting.size, 3.0)
     effect = GradualChange(knots, share, torch.ones_like(factor), factor, setting.even(0.5, 2.0))
     return Drawn(effect, setting.of_each("factor", factor))
+
+
+@draws(PeriodicNoise)
+def _(setting: Setting) -> Drawn:
+    cycles, factor = setting.even(8, 20), setting.sizes(1.5, 2.0, 1.0) ** min(setting.size, 4.0)
+    f = cycles * RATE / setting.n_samples
+    at = torch.arange(64, dtype=torch.float64) / 64
+    profile = (1 + (2 * math.pi * (at - setting.even(0, 1))).cos()) / 2
+    profile = (profile - profile.min()) / (profile.max() - profile.min())
+    effect = PeriodicNoise(f, profile, torch.ones_like(factor), factor, setting.even(0.5, 2.0))
+    return Drawn(effect, {"frequency": f, **setting.of_each("factor", factor)})
 
 
 @draws(ChannelNoise)

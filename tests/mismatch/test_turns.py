@@ -1,4 +1,4 @@
-"""What takes turns: converters of two gains, and tones that go up and down with a period."""
+"""What takes turns: converters of two gains, and tones and noise that go up and down with a period."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from scipy.signal import lfilter
 
 import gyrofuse as gf
 from gyrofuse.mismatch.detectors.lines.interleaving import size_alternation
+from gyrofuse.mismatch.mechanisms.regimes.periodic_noise import PeriodicNoise
 from gyrofuse.mismatch.mechanisms.signals.harmonics import harmonics_of, sidebands_of
 from gyrofuse.mismatch.mechanisms.transients.modulated_tone import ModulatedTone
 from gyrofuse.mismatch.mechanisms.values.interleaved_gain import InterleavedGain
@@ -137,3 +138,35 @@ def test_they_are_named_once(made: Array):
     assert [f.mechanism for f in report.findings] == ["vibration_tone"]
     assert report.held_out.after < 1.5
     assert math.isfinite(report.findings[0].parameters["modulation"].value)
+
+
+def breathing(seed: int, frequency_hz: float, depth: float) -> Array:
+    """Noise of two sensors whose size follows a sine."""
+    made = noise(seed)
+    made[:2] *= 1 + depth * np.sin(2 * np.pi * frequency_hz * T)
+    return made
+
+
+@pytest.mark.parametrize("frequency_hz", [0.13, 1.7])
+def test_noise_that_breathes_has_its_period_and_its_factor(frequency_hz: float):
+    found = PeriodicNoise.detect_and_fit(compared(breathing(20, frequency_hz, 0.4), noise(21)), 1e-3)
+    assert found is not None
+    assert found.sensors == (0, 1)
+    limits = found.parameters["frequency"]
+    assert limits.low - (limits.high - limits.low) < frequency_hz < limits.high + (limits.high - limits.low)
+    assert found.parameters["factor[0]"].value == pytest.approx((1.4 / 0.6) ** 2, rel=0.25)
+
+
+def test_a_level_that_wanders_or_changes_once_has_no_period():
+    rng = np.random.default_rng(22)
+    wander = np.exp(0.5 * lfilter([0.045], [1, -0.999], rng.normal(size=N)))
+    once = np.where(np.arange(N) > N // 2, 1.5, 1.0)
+    for course in (wander, once):
+        assert PeriodicNoise.detect_and_fit(compared(noise(23) * course, noise(24)), 1e-3) is None
+
+
+@pytest.mark.slow
+def test_noise_that_breathes_is_named():
+    report = gf.diagnose(torch.from_numpy(breathing(25, 0.6, 0.4)), torch.from_numpy(noise(26)), rate=RATE)
+    assert [(f.mechanism, f.sensors) for f in report.findings] == [("variance_change", (0, 1))]
+    assert report.held_out.after < 1.5

@@ -100,9 +100,9 @@ class ChannelNoise(LevelCourse):
         ]
         score, ends, bend, course = max(bent, key=lambda one: one[0])
         score -= math.log(len(tried) * len(bends))
-        if score < _of_episodes(comparison) + NATS_AS_GOOD or _more_than(comparison, course):
+        if score < score_of_episodes(comparison) + NATS_AS_GOOD or still_goes_up_and_down(comparison, course):
             return None
-        known = _as_it_goes(of_the_fast_noise(comparison, course, course.share > MOSTLY), course)
+        known = as_it_goes(of_the_fast_noise(comparison, course, course.share > MOSTLY), course)
         base = over_the_simulation(comparison, known)
         effect = cls(name, row, kind, ends, bend, base, known.factor, known.corner * info.rate, lines_of(comparison))
         sensors = tuple((known.factor != 1).nonzero()[:, 0].tolist())
@@ -170,8 +170,12 @@ def _share(values: Tensor, ends: Tensor, bend: float) -> Tensor:
 
 
 def _fitted(white: Tensor, values: Tensor, ends: Tensor, bend: float) -> Course | None:
-    """The level that whitened samples have along a course; None where it does not change."""
-    share, squares = _share(values, ends, bend), white.square()
+    return level_along(white, _share(values, ends, bend))
+
+
+def level_along(white: Tensor, share: Tensor) -> Course | None:
+    """The level that whitened samples have along a course `(time,)`; None where it does not change."""
+    squares = white.square()
     every = torch.ones(len(white), dtype=torch.bool)
     _, change, sd = fitted_levels(squares, share, every)
     known = 3.0  # standard deviations
@@ -182,7 +186,7 @@ def _fitted(white: Tensor, values: Tensor, ends: Tensor, bend: float) -> Course 
     return Course(share, base.exp(), change.exp(), sd)
 
 
-def _as_it_goes(known: VarianceCourse, course: Course) -> VarianceCourse:
+def as_it_goes(known: VarianceCourse, course: Course) -> VarianceCourse:
     """A course that was turned round, so that it ends where it began, the other way again."""
     if float(known.course[course.share.argmax()]) >= float(known.course[course.share.argmin()]):
         return known
@@ -190,7 +194,7 @@ def _as_it_goes(known: VarianceCourse, course: Course) -> VarianceCourse:
     return replace(known, course=1 - known.course, factor=1 / known.factor, base=base)
 
 
-def _of_episodes(comparison: Comparison) -> float:
+def score_of_episodes(comparison: Comparison) -> float:
     """Score of episodes with starts and stops, where there are any."""
     found = likeliest_episodes(comparison)
     if found is None:
@@ -200,7 +204,7 @@ def _of_episodes(comparison: Comparison) -> float:
     return course_score(white, at_once, own_spread(comparison).weight, len(found.episodes))
 
 
-def _more_than(comparison: Comparison, course: Course) -> bool:
+def still_goes_up_and_down(comparison: Comparison, course: Course) -> bool:
     """Whether the level still goes up and down beside the course."""
     left, share = 1e-3, 0.1  # p value, and of what goes up and down without the course
     rest = modulation_of(whitened_recording(comparison) / course.variance.sqrt())
