@@ -124,7 +124,6 @@ _COMBINED: dict[str, tuple[str, str]] = {
 }
 
 _OUTSIDE: dict[str, Callable[[Bench, float], Part]] = {
-    "cyclostationary_noise": _with(strange.modulated_noise, slow=False),
     "am_noise": _with(strange.modulated_noise, slow=True),
     "hysteresis": strange.hysteresis,
     "power_1.5": _with(spectral.power_law, mechanism="power_1.5", exponent=1.5),
@@ -143,6 +142,7 @@ _FORMS: dict[str, Callable[[Bench, float], Part]] = {
     "band_stop": filters.band_stop,
     "harmonics": forms.harmonics,
     "laplace_noise": strange.laplace_noise,
+    "periodic_noise": _with(strange.modulated_noise, slow=False),
     "modulated": forms.modulated,
     "rotor": forms.rotor,
     "bursts_of_a_tone": forms.bursts_of_a_tone,

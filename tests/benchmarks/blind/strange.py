@@ -102,14 +102,9 @@ def modulated_noise(bench: Bench, nats: float, *, slow: bool) -> Part:
         course = relaxator(bench.n, math.exp(-10 / bench.n), 1.0, bench.rng)
     else:
         course = np.sin(2 * np.pi * (bench.rng.uniform(0.1, 10) * t + bench.rng.uniform()))
-    return noise_of_level(
-        bench,
-        "am_noise" if slow else "cyclostationary_noise",
-        nats,
-        sensors,
-        course,
-        look_alikes=("variance_change",) if slow else (),
-    )
+    name, alike = ("am_noise", ("variance_change",)) if slow else ("variance_change", ())
+    part = noise_of_level(bench, name, nats, sensors, course, look_alikes=alike)
+    return part if slow else replace(part, form="periodic")
 
 
 def noise_of_level(
