@@ -9,6 +9,7 @@ from typing import Annotated, ClassVar
 import torch
 from torch import Tensor
 
+from gyrofuse._base.axes import DASHED, INK, finish
 from gyrofuse._base.transforms import squared_modulus
 from gyrofuse.mismatch.decisions import NATS_AS_GOOD, NATS_PER_NUMBER
 from gyrofuse.mismatch.detectors.variance.noise_level import (
@@ -30,6 +31,7 @@ from gyrofuse.mismatch.mechanisms.regimes.changing_variance import (
 from gyrofuse.mismatch.mechanisms.regimes.channel_noise import as_it_goes, level_along, score_of_episodes
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import Dims, OfSensors
+from gyrofuse.mismatch.signals.lines import whitened
 from gyrofuse.mismatch.signals.variance_course import VarianceCourse
 from gyrofuse.mismatch.stats.limits import Z
 from gyrofuse.mismatch.stats.segments import course_scores
@@ -110,8 +112,24 @@ class PeriodicNoise(LevelCourse):
         return super(PeriodicNoise, replace(self, profile=self.profile.roll(turned))).apply(signal, info, generator)
 
     def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
-        course = self.course(comparison.n_samples, comparison.info).variance if fitted else None
-        pictures.variance_over_time(ax, comparison, sensor, course)
+        """Variance over the phase of the period."""
+        phases, n = 64, comparison.n_samples
+        turns = torch.remainder(torch.arange(n, dtype=torch.float64) * self.frequency_hz / comparison.info.rate, 1.0)
+        bins, at = (turns * phases).long() % phases, (torch.arange(phases) + 0.5) / phases
+
+        def folded(values: Tensor) -> Tensor:
+            count = torch.bincount(bins, minlength=phases).clamp(min=1)
+            return torch.zeros(phases, dtype=values.dtype).index_add(0, bins, values) / count
+
+        white = whitened(comparison.observed.steady[0], comparison.base)
+        level = folded(white[sensor].square())
+        handles = ax.plot(at.numpy(), level.numpy(), color=INK, marker="o", markersize=3, linestyle="none")
+        if fitted:
+            course = folded(self.course(n, comparison.info).variance[sensor])
+            handles += ax.plot(at.numpy(), (course * level.mean() / course.mean()).numpy(), **DASHED)
+        ax.set_xlabel(f"phase of the period of {self.frequency_hz:.4g} Hz")
+        ax.set_ylabel("variance over the simulation's")
+        finish(ax, handles, ["recording", "fitted"][: len(handles)])
 
 
 def _at(profile: Tensor, f: float, n_samples: int) -> Tensor:

@@ -91,7 +91,7 @@ class ModulatedTone(VibrationTone):
 
     def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
         reach = (max(abs(one.multiple) for one in self.harmonics) + 1) * self.modulation_hz
-        pictures.spectrum_near(ax, comparison, sensor, self.frequency_hz, reach)
+        pictures.spectrum_near(ax, comparison, sensor, self.frequency_hz, reach / 12)
 
     def wander(self, comparison: Comparison, noise: Tensor, energy: float) -> float:
         """None beside what is periodic, where its own line may be faint."""

@@ -6,9 +6,11 @@ import math
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from gyrofuse._base.axes import BLUE, INK, finish, with_unit
 from gyrofuse.mismatch.detectors.lines.interleaving import size_alternation
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
@@ -87,7 +89,15 @@ class InterleavedGain(Mechanism):
         return held_out_blocks(self._scores(comparison, keep), fold).sum((0, -1))
 
     def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
-        pictures.samples(ax, comparison, sensor, 0, 60)
+        """Histograms of even and of odd samples."""
+        own = comparison.recording[sensor] - comparison.recording[sensor].mean()
+        reach, handles = 4.5 * float(own.std()), []
+        for part, color in ((own[::2], INK), (own[1::2], BLUE)):
+            share, edges = np.histogram(part.numpy(), np.linspace(-reach, reach, 101))
+            handles.append(ax.stairs(share / len(part), edges, color=color, linewidth=1.2))
+        ax.set_xlabel(with_unit("value from the mean", comparison.info.measure), parse_math=False)
+        ax.set_ylabel("share of the samples in a bin")
+        finish(ax, handles, ["even samples", "odd samples"])
 
     def _factors(self, signal: Tensor) -> Tensor:
         odd = torch.arange(signal.shape[-1]) % 2 == 1
