@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -14,10 +13,9 @@ from gyrofuse.mismatch.detectors.variance.level_spread import level_lasts
 from gyrofuse.mismatch.detectors.variance.outliers import spike_p_value
 from gyrofuse.mismatch.likelihoods.laws.heavy_tails import HeavyTails
 from gyrofuse.mismatch.likelihoods.laws.outlier_law import clustered
-from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
-from gyrofuse.mismatch.mechanisms.regimes.scale_mixture import ScaleMixture
+from gyrofuse.mismatch.mechanisms.mechanism import Finding
+from gyrofuse.mismatch.mechanisms.regimes.scale_mixture import InnovationsLaw
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.dims import OfSensors
@@ -28,7 +26,7 @@ from gyrofuse.mismatch.stats.limits import Z
 
 
 @dataclass(frozen=True, eq=False)
-class HeavyTailedNoise(Mechanism):
+class HeavyTailedNoise(InnovationsLaw):
     """`x_t = sum_k psi_k s_{t-k} e_{t-k}`, `s` independent from sample to sample, of a continuous law, mean square one.
 
     The innovations of the noise are Student's, or a normal plus a Laplace variable: both are normal with a variance
@@ -39,10 +37,6 @@ class HeavyTailedNoise(Mechanism):
         width: Width of the Laplace variable over the standard deviation of the normal one, `(sensor,)`, likewise.
     """
 
-    name: ClassVar[str] = ScaleMixture.name
-    likelihood: ClassVar[str] = ScaleMixture.likelihood
-    rivals: ClassVar[tuple[str, ...]] = ("variance_change",)
-    separated_by: ClassVar[str] = ScaleMixture.separated_by
     freedom: OfSensors
     width: OfSensors
 
@@ -108,13 +102,6 @@ class HeavyTailedNoise(Mechanism):
             factors[..., i, :] = HeavyTails(laplace, self._shape(i), 1.0).factors(signal[..., i, :], generator)
         heavy = ((self.freedom > 0) | (self.width > 0))[:, None]
         return torch.where(heavy, scaled_innovations(signal, factors), signal)
-
-    def apply_to_reference(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
-        built = super().apply_to_reference(comparison, generator)
-        return replace(built, reference=replace(built.reference, gaussian=False))
-
-    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
-        pictures.tails(ax, comparison, sensor)
 
     @property
     def _heavy(self) -> list[tuple[int, bool]]:

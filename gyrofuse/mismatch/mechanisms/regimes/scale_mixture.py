@@ -26,8 +26,24 @@ from gyrofuse.mismatch.signals.prediction_errors import left_out, scaled_innovat
 from gyrofuse.mismatch.stats.limits import Z
 
 
+class InnovationsLaw(Mechanism):
+    """Innovations of noise that are no normal ones, though independent from sample to sample."""
+
+    name: ClassVar[str] = "scale_mixture"
+    likelihood: ClassVar[str] = "innovations"
+    rivals: ClassVar[tuple[str, ...]] = ("variance_change", "nonlinearity")
+    separated_by: ClassVar[str] = "a longer recording, or the converter's raw words"
+
+    def apply_to_reference(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
+        built = super().apply_to_reference(comparison, generator)
+        return replace(built, reference=replace(built.reference, gaussian=False))
+
+    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
+        pictures.tails(ax, comparison, sensor)
+
+
 @dataclass(frozen=True, eq=False)
-class ScaleMixture(Mechanism):
+class ScaleMixture(InnovationsLaw):
     """`x_t = sum_k psi_k s_{t-k} e_{t-k}`, `s` independent from sample to sample, of two values, with mean square one.
 
     The innovations `e` of the noise are larger by `ratio` with the probability `share`. The spectrum stays as it is,
@@ -39,10 +55,6 @@ class ScaleMixture(Mechanism):
         ratio: Of the larger standard deviation to the smaller one, `(sensor,)`.
     """
 
-    name: ClassVar[str] = "scale_mixture"
-    likelihood: ClassVar[str] = "innovations"
-    rivals: ClassVar[tuple[str, ...]] = ("variance_change", "nonlinearity")
-    separated_by: ClassVar[str] = "a longer recording, or the converter's raw words"
     share: OfSensors
     ratio: OfSensors
 
@@ -114,13 +126,6 @@ class ScaleMixture(Mechanism):
         scale = (1 - self.share + self.share * self.ratio.square()).rsqrt()[:, None]
         factors = scale * torch.where(hit, self.ratio[:, None], 1.0)
         return torch.where((self.share > 0)[:, None], scaled_innovations(signal, factors), signal)
-
-    def apply_to_reference(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
-        built = super().apply_to_reference(comparison, generator)
-        return replace(built, reference=replace(built.reference, gaussian=False))
-
-    def plot(self, comparison: Comparison, ax: pictures.Axes, *, sensor: int, fitted: bool) -> None:
-        pictures.tails(ax, comparison, sensor)
 
 
 def _simulated(comparison: Comparison, sensor: int, row: Tensor) -> Tensor:
