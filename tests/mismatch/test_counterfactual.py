@@ -18,7 +18,7 @@ from gyrofuse.mismatch.detectors.spectra.peaks import Stretch
 from gyrofuse.mismatch.detectors.spectra.steadiness import Steadiness, steadiness
 from gyrofuse.mismatch.mechanisms.finding_parts import Alternative, Parameter
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, repaired
-from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone, amplitude_limits, line_near
+from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone, line_near
 from gyrofuse.mismatch.mechanisms.slow.late_warm_up import LateWarmUp
 from gyrofuse.mismatch.mechanisms.slow.step import Step
 from gyrofuse.mismatch.mechanisms.slow.warm_up import WarmUpTransient
@@ -38,6 +38,7 @@ from gyrofuse.mismatch.selection.forward import Selected
 from gyrofuse.mismatch.selection.held_out import HeldOutScore, score_held_out
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.folds import sd_of_sum
+from gyrofuse.mismatch.stats.limits import amplitude_limits
 
 MODEL = gf.WhiteNoise(1.0) + gf.AR1(0.999, 1e-4) + gf.RandomWalk(1e-8)
 N, RATE, SENSORS = 2**14, 100.0, 4

@@ -78,8 +78,7 @@ def size_alternation(comparison: Comparison) -> Alternation:
     """
     own = _alternation(_log_sizes(comparison.recording))
     simulated = _alternation(_log_sizes(comparison.reference.signal[0])).p_value
-    p_value = own.p_value if simulated > CHANCE else p_value_beyond_reference(own.p_value, simulated)
-    return own._replace(p_value=p_value)
+    return own._replace(p_value=p_value_beyond_reference(own.p_value, simulated))
 
 
 def _log_sizes(signal: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import ClassVar
 
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.detectors.variance.noise_level import compared_levels, own_spread, whitened_recording
 from gyrofuse.mismatch.mechanisms import pictures
+from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.folds import estimation_samples, held_out_blocks
@@ -20,6 +22,7 @@ from gyrofuse.mismatch.signals.variance_course import (
     likely_corners,
     whitened_factor,
 )
+from gyrofuse.mismatch.stats.limits import Z
 from gyrofuse.mismatch.stats.segments import course_scores
 from gyrofuse.mismatch.stats.variance_courses import Course, fitted_levels
 
@@ -139,3 +142,31 @@ def over_the_simulation(comparison: Comparison, known: VarianceCourse) -> Tensor
     weight = observed.dof * reference.dof / (observed.dof + reference.dof).clamp(min=1e-300) * fast
     over = ((observed.power / reference.power.clamp(min=1e-300)).clamp(min=1e-300).log() @ weight / weight.sum()).exp()
     return torch.where(known.factor != 1, known.base * over, 1.0)
+
+
+def level_along(white: Tensor, share: Tensor) -> Course | None:
+    """The level that whitened samples have along a course `(time,)`; None where it does not change."""
+    squares = white.square()
+    every = torch.ones(len(white), dtype=torch.bool)
+    _, change, sd = fitted_levels(squares, share, every)
+    known = 3.0  # standard deviations
+    concerned = change.abs() > known * sd
+    if not bool(concerned.any()):
+        return None
+    base, change, sd = fitted_levels(squares, share, concerned)
+    return Course(share, base.exp(), change.exp(), sd)
+
+
+def as_it_goes(known: VarianceCourse, course: Course) -> VarianceCourse:
+    """A course that was turned round, so that it ends where it began, the other way again."""
+    if float(known.course[course.share.argmax()]) >= float(known.course[course.share.argmin()]):
+        return known
+    base = torch.as_tensor(known.base) * known.factor
+    return replace(known, course=1 - known.course, factor=1 / known.factor, base=base)
+
+
+def factor_limits(factor: Tensor, course: Course) -> dict[str, Parameter]:
+    """Factors `(sensor,)` of the sensors that change, with the limits that those of a course have."""
+    changing = (factor != 1).nonzero()[:, 0].tolist()
+    reach = Z * course.log_factor_sd
+    return {f"factor[{i}]": Parameter.within(float(factor[i]), math.exp(float(reach[i])), "") for i in changing}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 import torch
@@ -19,11 +19,13 @@ from gyrofuse.mismatch.detectors.variance.noise_level import (
     variance_p_value,
     whitened_recording,
 )
-from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
 from gyrofuse.mismatch.mechanisms.mechanism import Finding
 from gyrofuse.mismatch.mechanisms.regimes.changing_variance import (
     MOSTLY,
     LevelCourse,
+    as_it_goes,
+    factor_limits,
+    level_along,
     lines_of,
     of_the_fast_noise,
     over_the_simulation,
@@ -32,10 +34,9 @@ from gyrofuse.mismatch.mechanisms.regimes.variance_change import likeliest_episo
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import Dims, OfSensors
 from gyrofuse.mismatch.signals.variance_course import VarianceCourse
-from gyrofuse.mismatch.stats.limits import Z
 from gyrofuse.mismatch.stats.multiplicity import sidak
 from gyrofuse.mismatch.stats.segments import course_scores
-from gyrofuse.mismatch.stats.variance_courses import Course, course_at_once, course_score, fitted_levels
+from gyrofuse.mismatch.stats.variance_courses import Course, course_at_once, course_score
 
 _WORDS = {"level": "", "size": "the size of ", "vibration": "the vibration in "}
 
@@ -86,7 +87,11 @@ class ChannelNoise(LevelCourse):
             for row, values in enumerate(info.channel_rows(name))
             for kind, values in _courses(values).items()
         ]
-        fitted = [(entry, _fitted(white, entry[-1], _ends(entry[-1]), 0.0)) for entry in tried if _moves(entry[-1])]
+        fitted = [
+            (entry, level_along(white, _share(entry[-1], _ends(entry[-1]), 0.0)))
+            for entry in tried
+            if _moves(entry[-1])
+        ]
         changing = [(course_score(white, course, weight), *entry) for entry, course in fitted if course is not None]
         if not changing:
             return None
@@ -96,20 +101,16 @@ class ChannelNoise(LevelCourse):
             (course_score(white, course, weight), ends, bend, course)
             for ends in (low_to_high, low_to_high.flip(0))
             for bend in bends
-            if (course := _fitted(white, values, ends, bend)) is not None
+            if (course := level_along(white, _share(values, ends, bend))) is not None
         ]
         score, ends, bend, course = max(bent, key=lambda one: one[0])
         score -= math.log(len(tried) * len(bends))
-        if score < score_of_episodes(comparison) + NATS_AS_GOOD or still_goes_up_and_down(comparison, course):
+        if score < score_of_episodes(comparison) + NATS_AS_GOOD or _still_goes_up_and_down(comparison, course):
             return None
         known = as_it_goes(of_the_fast_noise(comparison, course, course.share > MOSTLY), course)
         base = over_the_simulation(comparison, known)
         effect = cls(name, row, kind, ends, bend, base, known.factor, known.corner * info.rate, lines_of(comparison))
         sensors = tuple((known.factor != 1).nonzero()[:, 0].tolist())
-        parameters = {}
-        for i in sensors:
-            value, reach = float(known.factor[i]), math.exp(Z * float(course.log_factor_sd[i]))
-            parameters[f"factor[{i}]"] = Parameter.within(value, reach, "")
         largest = max(sensors, key=lambda i: abs(math.log(float(known.factor[i]))))
         return effect.found(
             f"the noise's variance in {info.named(sensors, 'all sensors')} follows {_WORDS[kind]}{readable(name)}"
@@ -118,7 +119,7 @@ class ChannelNoise(LevelCourse):
             f"{float(ends[1]):.4g} of it",
             p_value,
             sensors,
-            parameters,
+            factor_limits(known.factor, course),
             levels=(1,),
             channel=name,
             gain=float(weight @ course_scores(white, course.variance).sum(-1)),
@@ -169,31 +170,6 @@ def _share(values: Tensor, ends: Tensor, bend: float) -> Tensor:
     return torch.log1p(bend * straight) / math.log1p(bend) if bend else straight
 
 
-def _fitted(white: Tensor, values: Tensor, ends: Tensor, bend: float) -> Course | None:
-    return level_along(white, _share(values, ends, bend))
-
-
-def level_along(white: Tensor, share: Tensor) -> Course | None:
-    """The level that whitened samples have along a course `(time,)`; None where it does not change."""
-    squares = white.square()
-    every = torch.ones(len(white), dtype=torch.bool)
-    _, change, sd = fitted_levels(squares, share, every)
-    known = 3.0  # standard deviations
-    concerned = change.abs() > known * sd
-    if not bool(concerned.any()):
-        return None
-    base, change, sd = fitted_levels(squares, share, concerned)
-    return Course(share, base.exp(), change.exp(), sd)
-
-
-def as_it_goes(known: VarianceCourse, course: Course) -> VarianceCourse:
-    """A course that was turned round, so that it ends where it began, the other way again."""
-    if float(known.course[course.share.argmax()]) >= float(known.course[course.share.argmin()]):
-        return known
-    base = torch.as_tensor(known.base) * known.factor
-    return replace(known, course=1 - known.course, factor=1 / known.factor, base=base)
-
-
 def score_of_episodes(comparison: Comparison) -> float:
     """Score of episodes with starts and stops, where there are any."""
     found = likeliest_episodes(comparison)
@@ -204,7 +180,7 @@ def score_of_episodes(comparison: Comparison) -> float:
     return course_score(white, at_once, own_spread(comparison).weight, len(found.episodes))
 
 
-def still_goes_up_and_down(comparison: Comparison, course: Course) -> bool:
+def _still_goes_up_and_down(comparison: Comparison, course: Course) -> bool:
     """Whether the level still goes up and down beside the course."""
     left, share = 1e-3, 0.1  # p value, and of what goes up and down without the course
     rest = modulation_of(whitened_recording(comparison) / course.variance.sqrt())

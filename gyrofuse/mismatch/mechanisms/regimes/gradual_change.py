@@ -16,11 +16,11 @@ from gyrofuse.mismatch.detectors.variance.noise_level import (
     variance_p_value,
     whitened_recording,
 )
-from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
 from gyrofuse.mismatch.mechanisms.mechanism import Finding
 from gyrofuse.mismatch.mechanisms.regimes.changing_variance import (
     MOSTLY,
     LevelCourse,
+    factor_limits,
     lines_of,
     of_the_fast_noise,
     over_the_simulation,
@@ -35,7 +35,6 @@ from gyrofuse.mismatch.signals.dims import Dims, OfSensors
 from gyrofuse.mismatch.signals.variance_course import (
     VarianceCourse,
 )
-from gyrofuse.mismatch.stats.limits import Z
 from gyrofuse.mismatch.stats.segments import course_scores, stretch_of
 from gyrofuse.mismatch.stats.variance_courses import (
     Course,
@@ -110,17 +109,13 @@ class GradualChange(LevelCourse):
         knots = torch.tensor([0, *(share.diff().diff().abs() > _KINK).nonzero()[:, 0] + 1, comparison.n_samples - 1])
         effect = cls(knots / rate, share[knots], base, factor, corner * rate, lines_of(comparison))
         sensors = tuple((factor != 1).nonzero()[:, 0].tolist())
-        reach = Z * course.log_factor_sd
         rises = float(share[peak].mean()) > float(share[~peak].mean())
-        parameters, way = {}, _Way.of(course.share if rises else 1 - course.share, rate)
-        for i in sensors:
-            value, spread = float(factor[i]), math.exp(float(reach[i]))
-            parameters[f"factor[{i}]"] = Parameter.within(value, spread, "")
+        way = _Way.of(course.share if rises else 1 - course.share, rate)
         return effect.found(
             _sentence(comparison, None if waves else way, factor, sensors),
             p_value,
             sensors,
-            parameters,
+            factor_limits(factor, course),
             levels=(1,),
             time_s=(way.up or way.down or (0.0,))[0],
             gain=gain,

@@ -8,9 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.detectors.variance.haar_kurtosis import jump_test
 from gyrofuse.mismatch.detectors.variance.level_spread import level_lasts
-from gyrofuse.mismatch.detectors.variance.outliers import spike_p_value
 from gyrofuse.mismatch.likelihoods.laws.heavy_tails import HeavyTails
 from gyrofuse.mismatch.likelihoods.laws.outlier_law import clustered
 from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
@@ -42,12 +40,13 @@ class HeavyTailedNoise(InnovationsLaw):
 
     @classmethod
     def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
-        p_value = min(2 * min(spike_p_value(comparison), jump_test(comparison).p_value), 1.0)
+        p_value = cls.p_value(comparison)
         if p_value > level:
             return None
         z = left_out(comparison.observed).white[0]
         laws = _laws(comparison.observed)
-        gains = torch.stack([(law.gains(z[i]) - _simulated(comparison, i)).sum() for i, law in enumerate(laws)])
+        own = _simulated_gains(comparison)
+        gains = torch.stack([(law.gains(z[i]) - own[i]).sum() for i, law in enumerate(laws)])
         present = 15.0  # nats over normal noise, and over what the simulation has
         heavy = tuple((gains > present).nonzero()[:, 0].tolist())
         if not heavy or clustered(z[list(heavy)]) or any(level_lasts(z[i]) for i in heavy):
@@ -89,11 +88,11 @@ class HeavyTailedNoise(InnovationsLaw):
         return replace(self, freedom=freedom, width=width)
 
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
-        scores = torch.zeros_like(comparison.recording)
+        scores, own = torch.zeros_like(comparison.recording), _simulated_gains(comparison)
         for i, laplace in self._heavy:
             row = left_out(comparison.observed).white[0, i]
             law = HeavyTails.of_kind(laplace, row, self._shape(i))
-            scores[i] = law.gains(row) - _simulated(comparison, i)
+            scores[i] = law.gains(row) - own[i]
         return held_out_blocks(scores, fold).sum((0, -1))
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
@@ -119,7 +118,8 @@ def _laws(side: Records) -> list[HeavyTails]:
     return [HeavyTails.fitted(rows.flatten()) for rows in left_out(side).white.movedim(0, 1)]
 
 
-def _simulated(comparison: Comparison, sensor: int) -> Tensor:
-    """What the law of a sensor's simulation gains in its values, `(time,)`, whatever their scale."""
-    law, row = _laws(comparison.reference)[sensor], left_out(comparison.observed).white[0, sensor]
-    return HeavyTails.of_kind(law.laplace, row, law.shape).gains(row)
+@derived
+def _simulated_gains(comparison: Comparison) -> Tensor:
+    """What laws of the simulation gain in the recording, whatever their scale, `(sensor, time)`."""
+    pairs = zip(_laws(comparison.reference), left_out(comparison.observed).white[0], strict=True)
+    return torch.stack([HeavyTails.of_kind(law.laplace, row, law.shape).gains(row) for law, row in pairs])

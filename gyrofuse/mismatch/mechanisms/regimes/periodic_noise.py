@@ -24,11 +24,14 @@ from gyrofuse.mismatch.mechanisms.mechanism import Finding
 from gyrofuse.mismatch.mechanisms.regimes.changing_variance import (
     MOSTLY,
     LevelCourse,
+    as_it_goes,
+    factor_limits,
+    level_along,
     lines_of,
     of_the_fast_noise,
     over_the_simulation,
 )
-from gyrofuse.mismatch.mechanisms.regimes.channel_noise import as_it_goes, level_along, score_of_episodes
+from gyrofuse.mismatch.mechanisms.regimes.channel_noise import score_of_episodes
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import Dims, OfSensors
 from gyrofuse.mismatch.signals.lines import whitened
@@ -67,10 +70,11 @@ class PeriodicNoise(LevelCourse):
         if line is None:
             return None
         f, power = line
+        parts = _harmonics(comparison, f, list(seen.sensors))
         white, weight = whitened_recording(comparison), own_spread(comparison).weight
         tried = list[tuple[float, Tensor, Course]]()
-        for harmonics in (1, 2, 4, 16):
-            profile = _profile(comparison, f, list(seen.sensors), harmonics)
+        for harmonics in (1, 2, 4, len(parts)):
+            profile = _profile(parts[:harmonics])
             course = level_along(white, _at(profile, f, comparison.n_samples))
             if course is not None:
                 cost = 2 * NATS_PER_NUMBER * (harmonics - 1)
@@ -84,11 +88,8 @@ class PeriodicNoise(LevelCourse):
         base = over_the_simulation(comparison, known)
         effect = cls(f * info.rate, profile, base, known.factor, known.corner * info.rate, lines_of(comparison))
         reach = Z * math.sqrt(6 / power) / (2 * math.pi * comparison.n_samples) * info.rate
-        parameters = {"frequency": Parameter.around(f * info.rate, reach, "Hz", least=0.0)}
+        frequency = Parameter.around(f * info.rate, reach, "Hz", least=0.0)
         sensors = tuple((known.factor != 1).nonzero()[:, 0].tolist())
-        for i in sensors:
-            value, spread = float(known.factor[i]), math.exp(Z * float(course.log_factor_sd[i]))
-            parameters[f"factor[{i}]"] = Parameter.within(value, spread, "")
         largest = max(sensors, key=lambda i: abs(math.log(float(known.factor[i]))))
         return effect.found(
             f"the noise's variance goes up and down at {f * info.rate:.5g} Hz in "
@@ -96,7 +97,7 @@ class PeriodicNoise(LevelCourse):
             f"(sensor {info.sensors[largest]})",
             seen.p_value,
             sensors,
-            parameters,
+            {"frequency": frequency, **factor_limits(known.factor, course)},
             levels=(1,),
             frequency_hz=f * info.rate,
             gain=float(weight @ course_scores(white, course.variance).sum(-1)),
@@ -168,14 +169,19 @@ def _together(comparison: Comparison, sensors: list[int]) -> Tensor:
     return (squares / squares.mean(-1, keepdim=True)).mean(0) - 1
 
 
-def _profile(comparison: Comparison, f: float, sensors: list[int], harmonics: int) -> Tensor:
-    """The logarithm of the level over a period by a few harmonics, from 0 to 1, `(phase,)`."""
+def _harmonics(comparison: Comparison, f: float, sensors: list[int]) -> list[Tensor]:
+    """Complex amplitudes of the first harmonics of a frequency in the squares of sensors."""
+    most, t = 16, torch.arange(comparison.n_samples, dtype=torch.float64)
+    squares = _together(comparison, sensors)
+    return [torch.polar(squares, -2 * math.pi * k * f * t).mean() for k in range(1, most + 1)]
+
+
+def _profile(parts: list[Tensor]) -> Tensor:
+    """The logarithm of the level over a period by its first harmonics, from 0 to 1, `(phase,)`."""
     phases, least = 64, 0.05  # of the mean level
-    t = torch.arange(comparison.n_samples, dtype=torch.float64)
-    squares, at = _together(comparison, sensors), torch.arange(phases, dtype=torch.float64) / phases
+    at = torch.arange(phases, dtype=torch.float64) / phases
     level = torch.ones(phases, dtype=torch.float64)
-    for k in range(1, harmonics + 1):
-        part = torch.polar(squares, -2 * math.pi * k * f * t).mean()
+    for k, part in enumerate(parts, 1):
         level = level + 2 * (part * torch.polar(torch.ones_like(at), 2 * math.pi * k * at)).real
     logs = level.clamp(min=least).log()
     return (logs - logs.min()) / (logs.max() - logs.min()).clamp(min=1e-300)

@@ -20,6 +20,7 @@ from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples, held_out_blocks
 from gyrofuse.mismatch.signals.prediction_errors import left_out, scaled_innovations
@@ -33,6 +34,11 @@ class InnovationsLaw(Mechanism):
     likelihood: ClassVar[str] = "innovations"
     rivals: ClassVar[tuple[str, ...]] = ("variance_change", "nonlinearity")
     separated_by: ClassVar[str] = "a longer recording, or the converter's raw words"
+
+    @staticmethod
+    def p_value(comparison: Comparison) -> float:
+        """Of outliers, or of jumps, that the simulation does not have."""
+        return min(2 * min(spike_p_value(comparison), jump_test(comparison).p_value), 1.0)
 
     def apply_to_reference(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
         built = super().apply_to_reference(comparison, generator)
@@ -60,14 +66,14 @@ class ScaleMixture(InnovationsLaw):
 
     @classmethod
     def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
-        p_value = min(2 * min(spike_p_value(comparison), jump_test(comparison).p_value), 1.0)
+        p_value = cls.p_value(comparison)
         if p_value > level:
             return None
         z = left_out(comparison.observed).white[0]
         laws = [TwoLevels.fitted(row) for row in z]
         gains = [
-            float((law.gains(row) - _simulated(comparison, i, row)).sum())
-            for i, (law, row) in enumerate(zip(laws, z, strict=True))
+            float((law.gains(row) - own).sum())
+            for law, row, own in zip(laws, z, _simulated_gains(comparison), strict=True)
         ]
         rare = 0.03  # rarer ones are isolated outliers
         better, present = 10.0, 15.0  # nats over another heavy-tailed law, and over normal noise
@@ -113,12 +119,12 @@ class ScaleMixture(InnovationsLaw):
         return replace(self, share=torch.where(has, share, 0.0), ratio=torch.where(has, ratio, 1.0))
 
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
-        rows = []
+        rows, own = [], _simulated_gains(comparison)
         for i, row in enumerate(left_out(comparison.observed).white[0]):
             share, ratio = float(self.share[i]), float(self.ratio[i])
             small = float(row.square().mean().sqrt()) / math.sqrt(1 - share + share * ratio**2)
             law = TwoLevels(share, small, ratio * small)
-            rows.append(law.gains(row) - _simulated(comparison, i, row) if share else torch.zeros_like(row))
+            rows.append(law.gains(row) - own[i] if share else torch.zeros_like(row))
         return held_out_blocks(torch.stack(rows), fold).sum((0, -1))
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
@@ -128,9 +134,12 @@ class ScaleMixture(InnovationsLaw):
         return torch.where((self.share > 0)[:, None], scaled_innovations(signal, factors), signal)
 
 
-def _simulated(comparison: Comparison, sensor: int, row: Tensor) -> Tensor:
-    """What the law of a sensor's simulation gains in values `(time,)`: what else was found may make them as well."""
-    if bool(gaussian_sensors(comparison.reference)[sensor]):
-        return torch.zeros_like(row)
-    law = TwoLevels.fitted(left_out(comparison.reference).white[:, sensor].flatten())
-    return law.scaled_to(row[law.within(row)]).gains(row)
+@derived
+def _simulated_gains(comparison: Comparison) -> Tensor:
+    """What laws of the simulation gain in the recording `(sensor, time)`: what else was found may make such values."""
+    gains = torch.zeros_like(comparison.recording)
+    for i, row in enumerate(left_out(comparison.observed).white[0]):
+        if not bool(gaussian_sensors(comparison.reference)[i]):
+            law = TwoLevels.fitted(left_out(comparison.reference).white[:, i].flatten())
+            gains[i] = law.scaled_to(row[law.within(row)]).gains(row)
+    return gains

@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import torch
-from scipy import stats
 from torch import Tensor
 
 from gyrofuse._base.transforms import squared_modulus
@@ -24,10 +23,11 @@ from gyrofuse.mismatch.mechanisms.signals.harmonics import (
     tapered,
 )
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples
 from gyrofuse.mismatch.stats.inclusion import included_sensors
-from gyrofuse.mismatch.stats.limits import Z
+from gyrofuse.mismatch.stats.limits import Z, amplitude_limits
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,12 +78,10 @@ class VibrationTone(Mechanism):
         line = comparison.line
         if line.p_value > level:
             return None
-        tone = VibrationTone.at(comparison, line.frequency * comparison.info.rate)
-        sd = tone._sd(comparison)
-        family = cls._with_family(comparison, tone, float(tone._frequency_sds(comparison, sd)[0]))
-        if family is None:
+        tone = cls._with_family(comparison, *_line_alone(comparison))
+        if tone is None:
             return None
-        tone, sd = family, family._sd(comparison)
+        sd = tone._sd(comparison)
         spreads = tone._frequency_sds(comparison, sd) * comparison.info.rate
         squares = tone._squares(sd)
         snr = squares[0].sqrt()
@@ -91,8 +89,8 @@ class VibrationTone(Mechanism):
         seen, most_told = math.sqrt(there.least), 6  # harmonics with limits
         present = tuple(tone._has(squares).nonzero()[:, 0].tolist())
         parameters = {
-            name: _limits(value, sd, "Hz")
-            for (name, value), sd in zip(tone._frequencies().items(), spreads.tolist(), strict=True)
+            name: Parameter.around(value, Z * spread, "Hz")
+            for (name, value), spread in zip(tone._frequencies().items(), spreads.tolist(), strict=True)
         }
         low, value, high = sd[0, list(present)] * amplitude_limits(snr[list(present)], seen)
         for row in zip(present, value.tolist(), low.tolist(), high.tolist(), strict=True):
@@ -132,15 +130,8 @@ class VibrationTone(Mechanism):
         )
 
     @classmethod
-    def _with_family(cls, comparison: Comparison, tone: VibrationTone, spread: float) -> VibrationTone | None:
-        """A tone with lines that go along with it; None of what is nothing without them.
-
-        Args:
-            comparison: Recording and simulation.
-            tone: The line by itself.
-            spread: Standard deviation of its frequency, cycles per sample.
-        """
-        series = harmonics_of(comparison, tone.frequency_hz / comparison.info.rate, spread)
+    def _with_family(cls, comparison: Comparison, tone: VibrationTone, series: Harmonics) -> VibrationTone | None:
+        """A line by itself with those that go along with it; None of what is nothing without them."""
         return tone.with_harmonics(comparison, series) if series.others else tone
 
     def _has(self, squares: Tensor) -> Tensor:
@@ -364,36 +355,16 @@ def line_near(comparison: Comparison, f: float, reach: float) -> float:
     )
 
 
-def amplitude_limits(snr: Tensor, seen: float) -> Tensor:
-    """Lower limits, estimates and upper limits of amplitudes `(3, sensor)`, all in standard deviations.
+class _Alone(NamedTuple):
+    """A line by itself, and the lines at multiples of its frequency or of a part of that."""
 
-    For amplitudes that were estimated because they are above `seen` (those that are not for having been the largest):
-    the square is noncentral chi-square of two degrees of freedom, of which only the tail beyond `seen` comes here.
-    Weak ones are there because noise has made them larger; equal tails of that law cover them as often as strong ones.
-    Of the weakest both limits would be zero: none is below what the square less that of the noise says.
-    """
-    value = (snr.square() - 1).clamp(min=0.0).sqrt()
-    limits = value + Z * torch.tensor([[-1.0], [1.0]], dtype=torch.float64)
-    strong = 12.0  # standard deviations, from which the law is normal
-    weak = snr < strong
-    if bool(weak.any()):
-        low, high = _tail_limits(snr[weak], seen if float(snr.min()) > seen else 0.0)
-        limits[:, weak] = torch.stack([low, high.maximum(value[weak])])
-    return torch.stack([limits[0], value.clamp(limits[0], limits[1]), limits[1]])
+    tone: VibrationTone
+    series: Harmonics
 
 
-def _tail_limits(snr: Tensor, seen: float) -> Tensor:
-    """Amplitudes at which what comes beyond `seen` is beyond `snr` with 2.5 and 97.5 %, `(2, sensor)`, halved in on."""
-    tail, far, halvings = 0.025, 6.0, 40  # beyond either limit; standard deviations beyond which no amplitude is
-    wanted = torch.tensor([[tail], [1 - tail]], dtype=torch.float64)
-    low, high = torch.zeros(2, len(snr), dtype=torch.float64), (snr + far).repeat(2, 1)
-    for _ in range(halvings):
-        middle = (low + high) / 2
-        law = stats.ncx2(2, middle.square().numpy())
-        share = torch.from_numpy(law.sf(snr.square().numpy()) / law.sf(seen**2))
-        low, high = torch.where(share < wanted, middle, low), torch.where(share < wanted, high, middle)
-    return torch.where(low > 0, high, 0.0)
-
-
-def _limits(value: float, sd: float, unit: str) -> Parameter:
-    return Parameter.around(value, Z * sd, unit)
+@derived
+def _line_alone(comparison: Comparison) -> _Alone:
+    """The strongest line of the recording."""
+    tone = VibrationTone.at(comparison, comparison.line.frequency * comparison.info.rate)
+    spread = float(tone._frequency_sds(comparison, tone._sd(comparison))[0])
+    return _Alone(tone, harmonics_of(comparison, tone.frequency_hz / comparison.info.rate, spread))

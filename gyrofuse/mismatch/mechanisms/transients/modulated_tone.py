@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -11,7 +10,7 @@ from torch import Tensor
 from gyrofuse._base.transforms import squared_modulus
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Rival
-from gyrofuse.mismatch.mechanisms.signals.harmonics import harmonics_of, sidebands_of
+from gyrofuse.mismatch.mechanisms.signals.harmonics import Harmonics, sidebands_of
 from gyrofuse.mismatch.mechanisms.signals.tone import Harmonic, VibrationTone
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.stats.inclusion import included_sensors
@@ -31,12 +30,11 @@ class ModulatedTone(VibrationTone):
     modulation_hz: float = 1.0
 
     @classmethod
-    def _with_family(cls, comparison: Comparison, tone: VibrationTone, spread: float) -> ModulatedTone | None:
+    def _with_family(cls, comparison: Comparison, tone: VibrationTone, series: Harmonics) -> ModulatedTone | None:
         rate = comparison.info.rate
-        f = tone.frequency_hz / rate
-        found = sidebands_of(comparison, f)
+        found = sidebands_of(comparison, tone.frequency_hz / rate)
         # What turns has lines evenly beside each other as well: multiples of a frequency say more.
-        if found is None or len(found.orders) <= len(harmonics_of(comparison, f, spread).others):
+        if found is None or len(found.orders) <= len(series.others):
             return None
         none, every = torch.zeros_like(tone.cosine), torch.ones(comparison.n_samples, dtype=torch.bool)
         lines = tuple(Harmonic(k, none, none) for k in sorted(found.orders))
@@ -95,4 +93,4 @@ class ModulatedTone(VibrationTone):
 
     def wander(self, comparison: Comparison, noise: Tensor, energy: float) -> float:
         """None beside what is periodic, where its own line may be faint."""
-        return 0.0 if math.isfinite(energy) else math.nan
+        return 0.0

@@ -110,8 +110,7 @@ class InterleavedGain(Mechanism):
             error = whitened(signal, comparison.base)
             variance = error[:, keep].square().mean(-1, keepdim=True)
             terms.append(-variance.log() / 2 - error.square() / (2 * variance))
-        scores = terms[0] - terms[1] - factors.log()
-        return torch.where((self.even != self.odd)[:, None], scores, 0.0)
+        return terms[0] - terms[1] - factors.log()
 
 
 def _gains(comparison: Comparison, sensors: tuple[int, ...] | list[int], keep: Tensor) -> tuple[Tensor, Tensor]:
@@ -129,7 +128,6 @@ def _gains(comparison: Comparison, sensors: tuple[int, ...] | list[int], keep: T
     closer = gains.log().abs().argmin(0)
     own = gains.gather(0, closer[None])[0]
     gains = torch.where(own.log().abs() < near, gains / own, gains)
-    none = torch.ones(len(level), dtype=torch.bool)
-    none[list(sensors)] = False
-    even, other = torch.where(none, 1.0, gains)
-    return even, other
+    even, odd_ones = torch.ones_like(gains)
+    even[list(sensors)], odd_ones[list(sensors)] = gains[:, list(sensors)]
+    return even, odd_ones
