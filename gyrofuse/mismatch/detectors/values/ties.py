@@ -33,7 +33,8 @@ class Recurring(NamedTuple):
         sensor: Position of the sensor.
         value: Recurring value, unit of the signal.
         times: Number of returns to it.
-        samples: Number of samples that have it, those included whose predecessor has it as well.
+        samples: Number of samples that have it, those included whose predecessor has it as well where others do not
+            repeat; else as many fewer as these are.
         expected: Number of returns by chance.
         density: Samples around it per unit of the signal.
         effective_samples: Number of samples from which the density is known.
@@ -106,11 +107,13 @@ def recurring(sensor: int, values: Tensor, value: float | None = None) -> Recurr
     gap = above - below if math.isfinite(above - below) else 0.0
     around = torch.cat([counts[low:at], counts[at + 1 : high + 1]]).to(torch.float64)
     density = float(around.sum()) / max(float(unique[high] - unique[low]) - gap, 1e-300)
+    other = values != unique[at]
+    fresh = float(new[other].to(torch.float64).mean())  # share of the other samples that repeat none
     return Recurring(
         sensor=sensor,
         value=float(unique[at]),
         times=int(counts[at]),
-        samples=int((values == unique[at]).sum()),
+        samples=max(int(counts[at]), round(int((~other).sum()) * fresh)),
         # Values near a grid finer than the noise, such as that of rounded floats, recur as their neighbours do.
         expected=max(density * finest, float((around * (around - 1)).sum() / around.sum())),
         density=density,
@@ -238,7 +241,9 @@ def _law_beyond(found: Recurring, values: Tensor, sd: float) -> tuple[float, flo
 
 
 def _leaves_gap(found: Recurring, middle: float, sd: float) -> bool:
-    """Whether as many samples are missing around the value as returned to it: it is not one that was filled in.
+    """Whether as many samples are missing around the value as have it: it is not one that was filled in.
+
+    Samples that hold the value are missing as well, and say no more than the returns to it.
 
     The number missing follows from the density beside the band, as a normal law has it within; other laws are within a
     factor of 1.5. The nearest value that is left lies beyond the band by one on average.
@@ -251,6 +256,6 @@ def _leaves_gap(found: Recurring, middle: float, sd: float) -> bool:
     beside = 2 / (1 / each[0] + 1 / each[1])  # as many values on either side lie in stretches as long as they are rare
     wide = float(law.cdf(ends[1]) - law.cdf(ends[0])) / beside
     missing = max(wide, 2 * reach) * found.density
-    least = found.times * stats.f.ppf(CERTAIN, 2 * found.effective_samples, 2 * found.times)
+    least = found.samples * stats.f.ppf(CERTAIN, 2 * found.effective_samples, 2 * found.times)
     most = found.samples * stats.f.isf(CERTAIN, 2 * found.effective_samples, 2 * found.samples)
     return bool(least / 1.5 < missing < 1.5 * most - math.log(CERTAIN))

@@ -164,7 +164,8 @@ class StuckSamples(Mechanism):
             _mean_row(row, float(c), float(p)) if p > 0 else 1.0
             for row, c, p in zip(every, chance, probability, strict=True)
         ]
-        filler = [_filler(comparison.recording[i], every[i], max(length[i], _LONG)) for i in at]
+        held = [comparison.recording[i][_long_rows(every[i], max(length[i], _LONG))[:, 0]] for i in at]
+        filler = [_filler(values, held) for values in held]
         known = [value for value in filler if value is not None]
         put_out = dict(zip(at, known, strict=True)) if len(known) == len(at) else {}
         fills = tuple(put_out.get(i, 0.0) for i in range(comparison.n_sensors)) if put_out else ()
@@ -305,15 +306,25 @@ def at_once(held: Tensor, probability: Tensor) -> bool:
     return len(held) > 1 and jointly > _TOGETHER * float(probability.min())
 
 
-def _filler(values: Tensor, same: Tensor, long: float) -> float | None:
-    """The value `(time,)` that nearly all rows of repeats beyond half a length have; None where they have their own."""
-    fewest, nearly_all = 3, 0.9
+def _long_rows(same: Tensor, long: float) -> Tensor:
+    """First and last samples of the rows of repeats `(time,)` beyond half a length, `(row, 2)`."""
     rows = runs_of(same)
-    rows = rows[rows.diff()[:, 0] > long / 2]
-    if len(rows) < fewest:
+    return rows[rows.diff()[:, 0] > long / 2]
+
+
+def _filler(values: Tensor, of_all: list[Tensor]) -> float | None:
+    """The value that nearly all rows `(row,)` of a sensor hold; None where they hold their own, or are too few.
+
+    Args:
+        values: Of the rows of this sensor.
+        of_all: Of those of each sensor.
+    """
+    fewest, nearly_all = 3, 0.9
+    own, counts = values.unique(return_counts=True)
+    if not len(own) or int(counts.max()) <= nearly_all * len(values):
         return None
-    own, counts = values[rows[:, 0]].unique(return_counts=True)
-    return float(own[counts.argmax()]) if int(counts.max()) > nearly_all * len(rows) else None
+    value = own[counts.argmax()]
+    return float(value) if sum(int((rows == value).sum()) for rows in of_all) >= fewest else None
 
 
 def _rows(n: int, enter: float, leave: float, generator: torch.Generator) -> Tensor:
