@@ -360,4 +360,6 @@ def _nearest(comparison: Comparison, frequency_hz: float, start: int, stop: int)
     power = (torch.fft.fft(turned, n=padded * n).abs().square() * weights[:, None]).sum(0)
     reach = min(bins * padded, (padded * n - 1) // 2)  # a spell may be a few samples long
     near = torch.arange(-reach, reach + 1)
-    return frequency_hz + float(near[power[near].argmax()]) / (padded * n) * rate
+    frequencies = frequency_hz + near / (padded * n) * rate
+    inside = (frequencies > 0) & (frequencies < rate / 2)  # the bins of a short spell are wide
+    return float(frequencies[inside][power[near][inside].argmax()])
