@@ -93,7 +93,7 @@ def whitened_factor(factor: Tensor, corner: float) -> Tensor:
 
     The mean of `f^2 / (f^2 + f_c^2)` over all frequencies is `1 - 2 f_c atan(1 / 2 f_c)`.
     """
-    return 1 + (factor - 1) * _mean_share(corner)
+    return 1 + (factor - 1) * mean_fast_share(corner)
 
 
 def fast_factor(whitened: Tensor, corner: float) -> Tensor:
@@ -101,10 +101,11 @@ def fast_factor(whitened: Tensor, corner: float) -> Tensor:
 
     Not below a tenth of it: fast noise has no negative variance.
     """
-    return (1 + (whitened - 1) / _mean_share(corner)).maximum(0.1 * whitened)
+    return (1 + (whitened - 1) / mean_fast_share(corner)).maximum(0.1 * whitened)
 
 
-def _mean_share(corner: float) -> float:
+def mean_fast_share(corner: float) -> float:
+    """Mean of `fast_share` over all frequencies."""
     return 1 - 2 * corner * math.atan2(1, 2 * corner)
 
 

@@ -185,7 +185,9 @@ def _without_end_spikes(stairs: np.ndarray, information: float) -> np.ndarray:
     return stairs
 
 
-def fitted_levels(squares: Tensor, share: Tensor, concerned: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def fitted_levels(
+    squares: Tensor, share: Tensor, concerned: Tensor, steady: Tensor | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
     """Log variances where a course is 0, their change to where it is 1, and sds of the change, `(sensor,)` each.
 
     Fisher scoring; a sample has the information one half of a log variance.
@@ -194,7 +196,10 @@ def fitted_levels(squares: Tensor, share: Tensor, concerned: Tensor) -> tuple[Te
         squares: Squares of whitened samples, `(sensor, time)`.
         share: Course, `(time,)`.
         concerned: Sensors that change, `(sensor,)`.
+        steady: Variance that they have besides, all the time, `(sensor,)`; none by default.
     """
+    if steady is not None:
+        return _above_steady(squares, share, concerned, steady)
     design = torch.stack([torch.ones_like(share), share])
     inverse = torch.linalg.inv(design @ design.mT / 2)
     base = (squares.median(-1).values / CHI2_MEDIAN).clamp(min=1e-300).log()
@@ -205,6 +210,23 @@ def fitted_levels(squares: Tensor, share: Tensor, concerned: Tensor) -> tuple[Te
         steps = (inverse @ score.mT).clamp(-_STEEPEST, _STEEPEST)
         base, change = base + steps[0], torch.where(concerned, change + steps[1], 0.0)
     return base, change, inverse[1, 1].sqrt().expand(len(squares))
+
+
+def _above_steady(squares: Tensor, share: Tensor, concerned: Tensor, steady: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The same of variances `steady + exp(base + change c)`, beginning without what is steady."""
+    base, change, _ = fitted_levels(squares, share, concerned)
+    ends = torch.stack([base, base + change]).exp()
+    low, high = (ends - steady).maximum(0.1 * ends).log()
+    base, change = low, high - low
+    c = torch.stack([torch.ones_like(share), share])
+    for _ in range(25):
+        own = (base[:, None] + change[:, None] * share).exp()
+        variance = own + steady[:, None]
+        score = ((squares / variance).clamp(max=OUTLIER) - 1) / 2 * own / variance @ c.mT
+        information = torch.einsum("at,bt,st->sab", c, c, (own / variance).square()) / 2
+        steps = torch.linalg.solve(information, score).clamp(-_STEEPEST, _STEEPEST)
+        base, change = base + steps[:, 0], torch.where(concerned, change + steps[:, 1], 0.0)
+    return base, change, torch.linalg.inv(information)[:, 1, 1].sqrt()
 
 
 def _n_blocks(n: int) -> int:

@@ -20,7 +20,7 @@ from gyrofuse.mismatch.signals.variance_course import (
     fast_factor,
     fast_share,
     likely_corners,
-    whitened_factor,
+    mean_fast_share,
 )
 from gyrofuse.mismatch.stats.limits import Z
 from gyrofuse.mismatch.stats.segments import course_scores
@@ -78,11 +78,9 @@ class LevelCourse(ChangingVariance):
         share = self.course(comparison.n_samples, comparison.info).course[keep]
         if float(share.max()) == float(share.min()):
             return self
-        squares, concerned = whitened_recording(comparison).square()[:, keep], self.factor != 1
-        _, log_factor, _ = fitted_levels(squares, share, concerned)
-        corner = self.corner_hz / comparison.info.rate
-        upper = fast_factor(whitened_factor(self.base, corner) * log_factor.exp(), corner)
-        return replace(self, factor=torch.where(concerned, upper / self.base, 1.0))  # type: ignore[type-var]
+        white, concerned = whitened_recording(comparison)[:, keep], self.factor != 1
+        _, log_factor = fast_levels(white, share, concerned, self.corner_hz / comparison.info.rate)
+        return replace(self, factor=torch.where(concerned, log_factor.exp(), 1.0))  # type: ignore[type-var]
 
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
         course = self.course(comparison.n_samples, comparison.info)
@@ -111,9 +109,25 @@ def of_the_fast_noise(comparison: Comparison, course: Course, peak: Tensor) -> V
     base, log_factor = log_level[:, course.share.argmin()], log_level[:, course.share.argmax()]
     log_factor = torch.where(concerned, log_factor - base, 0.0)
     share = (log_factor @ (log_level - base[:, None]) / log_factor.square().sum()).clamp(0, 1)
+    base, log_factor = fast_levels(whitened_recording(comparison), share, concerned, corner)
     if float(share[0]) > MOSTLY and float(share[-1]) < 1 - MOSTLY:  # it goes one way: from what was to what came
         share, base, log_factor = 1 - share, base + log_factor, -log_factor
     return VarianceCourse(share, log_factor.exp(), corner, torch.where(concerned, base.exp(), 1.0))
+
+
+def fast_levels(white: Tensor, share: Tensor, concerned: Tensor, corner: float) -> tuple[Tensor, Tensor]:
+    """Log variance of the fast noise over its mean where a course is 0, and its change to where it is 1, `(sensor,)`.
+
+    Args:
+        white: Samples that are whitened as they are on average, `(sensor, time)`: slow noise is a part that is steady.
+        share: Course, `(time,)`.
+        concerned: Sensors that change, `(sensor,)`.
+        corner: Where slow noise is as strong as fast noise is on average, cycles per sample.
+    """
+    squares, fast = white.square(), mean_fast_share(corner)
+    mean = squares.mean(-1)
+    base, change, _ = fitted_levels(squares, share, concerned, (1 - fast) * mean)
+    return base - (fast * mean).log(), change
 
 
 def _corner_of(comparison: Comparison, peak: Tensor, ratio: Tensor, concerned: Tensor) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
 import torch
@@ -23,8 +23,8 @@ from gyrofuse.mismatch.mechanisms.mechanism import Finding
 from gyrofuse.mismatch.mechanisms.regimes.changing_variance import (
     MOSTLY,
     LevelCourse,
-    as_it_goes,
     factor_limits,
+    fast_levels,
     level_along,
     lines_of,
     of_the_fast_noise,
@@ -107,7 +107,9 @@ class ChannelNoise(LevelCourse):
         score -= math.log(len(tried) * len(bends))
         if score < score_of_episodes(comparison) + NATS_AS_GOOD or _still_goes_up_and_down(comparison, course):
             return None
-        known = as_it_goes(of_the_fast_noise(comparison, course, course.share > MOSTLY), course)
+        known, bend, ends = _along(
+            white, weight, of_the_fast_noise(comparison, course, course.share > MOSTLY), values, bends
+        )
         base = over_the_simulation(comparison, known)
         effect = cls(name, row, kind, ends, bend, base, known.factor, known.corner * info.rate, lines_of(comparison))
         sensors = tuple((known.factor != 1).nonzero()[:, 0].tolist())
@@ -168,6 +170,26 @@ def _share(values: Tensor, ends: Tensor, bend: float) -> Tensor:
     """The course of values `(time,)` from one end to the other."""
     straight = ((values - ends[0]) / (ends[1] - ends[0])).clamp(0, 1)
     return torch.log1p(bend * straight) / math.log1p(bend) if bend else straight
+
+
+def _along(
+    white: Tensor, weight: Tensor, known: VarianceCourse, values: Tensor, bends: tuple[float, ...]
+) -> tuple[VarianceCourse, float, Tensor]:
+    """The course along a channel's values `(time,)` of the fast noise alone, with its bend and its ends.
+
+    What whitened samples have of the slow noise bends a straight course where the fast one is quiet.
+    """
+    concerned, found = known.factor != 1, list[tuple[float, VarianceCourse, float, Tensor]]()
+    mean = white.square().mean(-1, keepdim=True)
+    for ends in (_ends(values), _ends(values).flip(0)):
+        for bend in bends:
+            share = _share(values, ends, bend)
+            base, log_factor = fast_levels(white, share, concerned, known.corner)
+            one = replace(known, course=share, factor=log_factor.exp(), base=torch.where(concerned, base.exp(), 1.0))
+            score = float(weight[concerned] @ course_scores(white, mean * one.variance).sum(-1)[concerned])
+            found.append((score, one, bend, ends))
+    _, one, bend, ends = max(found, key=lambda entry: entry[0])
+    return one, bend, ends
 
 
 def score_of_episodes(comparison: Comparison) -> float:
