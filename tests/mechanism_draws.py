@@ -19,6 +19,7 @@ from gyrofuse.mismatch.mechanisms.regimes.channel_noise import ChannelNoise
 from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
 from gyrofuse.mismatch.mechanisms.regimes.heavy_tails import HeavyTailedNoise
 from gyrofuse.mismatch.mechanisms.regimes.periodic_noise import PeriodicNoise
+from gyrofuse.mismatch.mechanisms.regimes.random_level import RandomLevelNoise
 from gyrofuse.mismatch.mechanisms.regimes.scale_mixture import ScaleMixture
 from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
 from gyrofuse.mismatch.mechanisms.regimes.telegraph import RandomTelegraph
@@ -288,6 +289,16 @@ def _(setting: Setting) -> Drawn:
     profile = (profile - profile.min()) / (profile.max() - profile.min())
     effect = PeriodicNoise(f, profile, torch.ones_like(factor), factor, setting.even(0.5, 2.0))
     return Drawn(effect, {"frequency": f, **setting.of_each("factor", factor)})
+
+
+@draws(RandomLevelNoise)
+def _(setting: Setting) -> Drawn:
+    factor = setting.sizes(1.9, 2.5, 1.0) ** min(setting.size, 3.0)
+    share, on_s = torch.full_like(factor, setting.even(0.2, 0.4)), torch.full_like(factor, setting.even(80, 160) / RATE)
+    share = torch.where(factor != 1, share, 0.0)
+    sources = tuple((factor != 1).long().tolist())
+    effect = RandomLevelNoise(sources, torch.ones_like(factor), factor, share, on_s, False, setting.even(0.5, 2.0))
+    return Drawn(effect, {**setting.of_each("factor", factor), **setting.of_each("time_on", on_s)})
 
 
 @draws(ChannelNoise)

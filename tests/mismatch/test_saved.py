@@ -21,6 +21,7 @@ from gyrofuse.mismatch.mechanisms.regimes.channel_noise import ChannelNoise
 from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
 from gyrofuse.mismatch.mechanisms.regimes.heavy_tails import HeavyTailedNoise
 from gyrofuse.mismatch.mechanisms.regimes.periodic_noise import PeriodicNoise
+from gyrofuse.mismatch.mechanisms.regimes.random_level import RandomLevelNoise
 from gyrofuse.mismatch.mechanisms.regimes.scale_mixture import ScaleMixture
 from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
 from gyrofuse.mismatch.mechanisms.regimes.telegraph import RandomTelegraph
@@ -133,6 +134,7 @@ EVERY = (
     PeriodicNoise(
         1 / 3, torch.tensor([0.0, 1 / 3, 1.0, 0.5], dtype=torch.float64), numbers(1.0, 0.9), numbers(4 / 3, 1.0), 0.7
     ),
+    RandomLevelNoise((4, 0), numbers(0.8, 1.0), numbers(4 / 3, 1.0), numbers(0.3, 0.0), numbers(0.7, 1.0), True, 0.7),
     HeavyTailedNoise(numbers(4 / 3 + 1, 0.0), numbers(0.0, 1 / 3)),
     ScaleMixture(numbers(0.2, 0.0), numbers(3.0, 1.0)),
     Spikes(numbers(0.05, 0.0), numbers(7 / 3, 0.0), numbers(0.3, 0.0), True),

@@ -14,6 +14,7 @@ from gyrofuse.mismatch.mechanisms.regimes.channel_noise import ChannelNoise
 from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
 from gyrofuse.mismatch.mechanisms.regimes.heavy_tails import HeavyTailedNoise
 from gyrofuse.mismatch.mechanisms.regimes.periodic_noise import PeriodicNoise
+from gyrofuse.mismatch.mechanisms.regimes.random_level import RandomLevelNoise
 from gyrofuse.mismatch.mechanisms.regimes.scale_mixture import ScaleMixture
 from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
 from gyrofuse.mismatch.mechanisms.regimes.telegraph import RandomTelegraph
@@ -102,7 +103,12 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (WanderingHarmonics,),  # each of whose lines alone looks like several tones, or like noise that changes
     (VibrationTone, ModulatedTone, ToneInSpells, ToneSize, Interleaving),
     (RandomTelegraph,),
-    (ChannelNoise, PeriodicNoise, GradualChange),  # where noise is louder, what is slow is known less well
+    (
+        ChannelNoise,
+        PeriodicNoise,
+        GradualChange,
+        RandomLevelNoise,
+    ),  # where noise is louder, what is slow is known less well
     (TemperatureDrift, WarmUpTransient, LateWarmUp, Ramp, Step, BiasOscillation),
     (SimulatedWarmUp, SimulatedRamp, SimulatedStep),
     (VarianceChange,),  # to which large jumps look alike

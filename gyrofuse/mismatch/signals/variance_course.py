@@ -13,7 +13,7 @@ from gyrofuse.mismatch.signals.filters import filtered
 from gyrofuse.mismatch.signals.known_lines import without_lines
 from gyrofuse.mismatch.signals.psd import bands, cross_spectra
 
-_CORNER = 1 / 64  # cycles per sample, for stretches too short to determine it
+CORNER = 1 / 64  # cycles per sample, for stretches too short to determine it
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +131,7 @@ def likely_corners(noise: Tensor, inside: Tensor, factor: Tensor) -> list[float]
     parts = [_longest(inside), _longest(~inside)]
     lengths = [b - a for a, b in parts]
     if min(lengths) < 256:
-        return [max(_CORNER, 1 / len(inside))]
+        return [max(CORNER, 1 / len(inside))]
     wanted = bands(lengths[0])
     powers = [cross_spectra(noise[None, :, a:b], wanted)[0].diagonal(dim1=-1, dim2=-2).real.mT for a, b in parts]
     ratio = (powers[0] / powers[1]).log()
@@ -145,7 +145,7 @@ def likely_corners(noise: Tensor, inside: Tensor, factor: Tensor) -> list[float]
 
     tried = {k: misfit(2.0**-k) for k in range(4, math.ceil(math.log2(len(inside))) + 1)}
     good = [k for k, chi2 in tried.items() if chi2 <= min(tried.values()) + 4.0]
-    return [2.0**-k for k in sorted(good, key=lambda k: abs(k + math.log2(_CORNER)))]
+    return [2.0**-k for k in sorted(good, key=lambda k: abs(k + math.log2(CORNER)))]
 
 
 def _longest(where: Tensor) -> tuple[int, int]:

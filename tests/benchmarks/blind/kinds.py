@@ -143,6 +143,7 @@ _FORMS: dict[str, Callable[[Bench, float], Part]] = {
     "harmonics": forms.harmonics,
     "laplace_noise": strange.laplace_noise,
     "periodic_noise": _with(strange.modulated_noise, slow=False),
+    "bursts_of_noise": strange.bursts_of_noise,
     "modulated": forms.modulated,
     "rotor": forms.rotor,
     "bursts_of_a_tone": forms.bursts_of_a_tone,

@@ -107,6 +107,16 @@ def modulated_noise(bench: Bench, nats: float, *, slow: bool) -> Part:
     return part if slow else replace(part, form="periodic")
 
 
+def bursts_of_noise(bench: Bench, nats: float) -> Part:
+    """White noise that is louder at random, for some tens of samples at a time: a bad contact, something that fires."""
+    sensors = bench.some_sensors(2)
+    length = bench.rng.uniform(6, 120)
+    lengths = bench.rng.exponential((length, length * bench.rng.uniform(2, 10)), (bench.n, 2)) + 1
+    ends = np.cumsum(lengths.ravel())
+    on = (np.searchsorted(ends, np.arange(bench.n), side="right") % 2 == 0).astype(float)
+    return replace(noise_of_level(bench, "variance_change", nats, sensors, on), form="bursts of noise")
+
+
 def noise_of_level(
     bench: Bench,
     mechanism: str,

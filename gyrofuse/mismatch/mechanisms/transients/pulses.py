@@ -15,6 +15,7 @@ from gyrofuse.mismatch.decisions import NATS_AS_GOOD, NATS_PER_NUMBER
 from gyrofuse.mismatch.detectors.lines.ring_cells import strongest_by_chance
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.detectors.variance.pulses import disordered, pulse_p_value, pulses_of, scanned_pulses
+from gyrofuse.mismatch.detectors.variance.random_levels import is_random_level
 from gyrofuse.mismatch.likelihoods.damped_tone import Surroundings
 from gyrofuse.mismatch.likelihoods.pulse import FittedPulse, Pulse, fitted_pulse, other_course, sized, width_limits
 from gyrofuse.mismatch.mechanisms import pictures
@@ -67,6 +68,9 @@ class Pulses(Transient):
             return None  # what is so conspicuous is something else
         info, rate = comparison.info, comparison.info.rate
         effect, strongest = cls.of(pulses, comparison), pulses[0]
+        gain = effect.gained(comparison, 3 * len(pulses) + int(effect.size.count_nonzero()))
+        if is_random_level(comparison, gain):
+            return None  # whose loud stretches are many
         around = _around(comparison, comparison.recording, strongest.pulse)
         width, often = strongest.pulse.width / rate, hourly(len(pulses), effect.duration_s)
         low, high = width_limits(around, strongest)
@@ -90,7 +94,7 @@ class Pulses(Transient):
             parameters,
             levels=(level_of(min(0.5 / strongest.pulse.width, 0.5)),),
             time_s=onset,
-            gain=effect.gained(comparison, 3 * len(pulses) + int(effect.size.count_nonzero())),
+            gain=gain,
         )
 
     @classmethod

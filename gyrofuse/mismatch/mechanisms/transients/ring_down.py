@@ -15,6 +15,7 @@ from gyrofuse.mismatch.detectors.lines.ring_cells import strongest_by_chance
 from gyrofuse.mismatch.detectors.lines.ring_downs import disordered, ring_down_p_value, ring_downs, scanned_ring_downs
 from gyrofuse.mismatch.detectors.moving.moving_lines import moving_line
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
+from gyrofuse.mismatch.detectors.variance.random_levels import is_random_level
 from gyrofuse.mismatch.likelihoods.damped_tone import DampedTone, FittedTone, Surroundings
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
@@ -85,6 +86,9 @@ class RingDown(Transient):
             return None
         info = comparison.info
         effect, strongest = cls.of(tones, comparison), tones[0]
+        gain = effect.gained(comparison, 3 * len(tones) + 2 * int((effect.amplitude > 0).sum()))
+        if is_random_level(comparison, gain):
+            return None  # whose loud stretches are many
         around = Surroundings.of(comparison.recording, comparison.base, strongest.tone.onset, strongest.tone.tau)
         frequency_sd, decay_sd, size_sd = around.sd(strongest)
         there = tuple((strongest.size != 0).any(0).nonzero()[:, 0].tolist())
@@ -117,7 +121,7 @@ class RingDown(Transient):
             levels=(level_of(strongest.tone.frequency),),
             frequency_hz=f,
             time_s=onset,
-            gain=effect.gained(comparison, 3 * len(tones) + 2 * int((effect.amplitude > 0).sum())),
+            gain=gain,
         )
 
     @classmethod
