@@ -255,8 +255,10 @@ def steady_shares(records: Tensor, wanted: Bands) -> Tensor:
     ordinates = torch.tensor([bins[k][1] - bins[k][0] for k in wide], dtype=torch.float64)
     dof = parts - 3  # of a record: a mean is subtracted
     excess = course.var(-2).sum(0) * dof * ordinates / parts  # chi-square, (sensor, band)
+    # Means of few ordinates are no normal variables: their variance scatters by their kurtosis as well.
+    spread = 1 + 3 * dof / ordinates
     dof *= n_records
-    certain = excess > float(stats.chi2.isf(rare / (p * len(wide)), dof))
+    certain = excess > spread * torch.from_numpy(stats.chi2.isf(rare / (p * len(wide)), dof / spread.numpy()))
     apart = course - course.mean(-2, keepdim=True)
     follows = sum((apart[..., k:, :] * apart[..., :-k, :]).sum((0, -2)) for k in (1, 2))
     longer = (1 + 2 * torch.as_tensor(follows) / apart.square().sum((0, -2)).clamp(min=1e-300)).clamp(min=1)
