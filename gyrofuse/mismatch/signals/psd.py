@@ -234,7 +234,7 @@ def steady_shares(records: Tensor, wanted: Bands) -> Tensor:
         records: `(record, sensor, time)`.
         wanted: Bands.
     """
-    parts, fewest, rare, low = 18, 64, 1e-3, 0.1  # of a record; bins; by chance; quantile of an estimate of `F`
+    parts, fewest, rare, low = 18, 64, 1e-4, 0.1  # of a record; bins; by chance; quantile of an estimate of `F`
     n_records, p, n = records.shape
     taper, shares = light_taper(n), torch.ones_like(wanted.dof)
     transform = torch.fft.rfft((records - records.mean(-1, keepdim=True)) * taper)

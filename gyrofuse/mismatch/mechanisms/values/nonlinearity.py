@@ -64,7 +64,7 @@ class Nonlinearity(Mechanism):
         at_ends = {end.sensor for end in end_stops(comparison) if end.p_value <= level}
         bent = dict[int, _Bend]()
         for i in included_sensors(scores.square().sum(-1), 2).positions:
-            if i not in at_ends and _has_a_density(comparison, i):
+            if i not in at_ends and _has_a_density(comparison, i) and not _alternates(comparison, i):
                 bend = _Bend.of(comparison.recording[i], comparison.base, i)
                 if bend.explains(comparison, first if float(p_values[i]) <= level else others):
                     bent[i] = bend
@@ -255,6 +255,12 @@ class _Bend(NamedTuple):
         """Those of noise as large as was felt."""
         felt = curve.at(self.noise.y)
         return curve.coefficients(float(felt.mean()), float(felt.std()))
+
+
+def _alternates(comparison: Comparison, sensor: int) -> bool:
+    """Whether every second sample is off: two laws in turns are no normal one, though nothing is bent."""
+    plain, white = 6.0, comparison.white[sensor]  # standard deviations
+    return abs(float(white[::2].sum() - white[1::2].sum())) > plain * math.sqrt(len(white))
 
 
 def _has_a_density(comparison: Comparison, sensor: int) -> bool:
