@@ -60,12 +60,13 @@ from gyrofuse.mismatch.mechanisms.spectra.bumps.wandering_harmonics import Wande
 from gyrofuse.mismatch.mechanisms.spectra.bumps.wandering_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
 from gyrofuse.mismatch.mechanisms.spectra.cross_talk import CrossTalk
-from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.spectra.high_pass import HighPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.moved_low_pass import MovedLowPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.notch import NotchFilter
 from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
+from gyrofuse.mismatch.mechanisms.spectra.slopes.flicker import FlickerNoise
+from gyrofuse.mismatch.mechanisms.spectra.slopes.power_law import PowerLawNoise
 from gyrofuse.mismatch.mechanisms.transients.channel_line import ChannelLine
 from gyrofuse.mismatch.mechanisms.transients.channel_tone import ChannelTone
 from gyrofuse.mismatch.mechanisms.transients.chirp import Chirp
@@ -674,6 +675,12 @@ def _(setting: Setting) -> Drawn:
 def _(setting: Setting) -> Drawn:
     rms = setting.sizes(0.15, 0.2) * setting.size
     return Drawn(FlickerNoise(rms.square() / 2), setting.of_each("level", rms))
+
+
+@draws(PowerLawNoise)
+def _(setting: Setting) -> Drawn:
+    density, slope = setting.sizes(1.1, 1.5) * setting.size, 0.6
+    return Drawn(PowerLawNoise(density.square(), slope, 0.01), {"slope": slope})
 
 
 @draws(CommonMode)

@@ -18,9 +18,9 @@ from gyrofuse.mismatch.mechanisms.spectra.bumps.oscillation import Mode
 from gyrofuse.mismatch.mechanisms.spectra.bumps.resonance import Resonance
 from gyrofuse.mismatch.mechanisms.spectra.bumps.wandering_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
-from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
+from gyrofuse.mismatch.mechanisms.spectra.slopes.flicker import FlickerNoise
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.filters import filtered, noise
 from gyrofuse.noise.array_model import ArrayModel

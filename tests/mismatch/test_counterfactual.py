@@ -26,8 +26,8 @@ from gyrofuse.mismatch.mechanisms.spectra.bumps.oscillation import Mode, wanderi
 from gyrofuse.mismatch.mechanisms.spectra.bumps.resonance import Resonance
 from gyrofuse.mismatch.mechanisms.spectra.bumps.wandering_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
-from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
+from gyrofuse.mismatch.mechanisms.spectra.slopes.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.values.rounding.quantization import Quantization
 from gyrofuse.mismatch.reporting.text import otherwise_words
 from gyrofuse.mismatch.selection import alternatives

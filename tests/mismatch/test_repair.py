@@ -14,7 +14,7 @@ from gyrofuse.mismatch.mechanisms.remainders.coherence import CoherenceRemainder
 from gyrofuse.mismatch.mechanisms.remainders.slow import SlowRemainder
 from gyrofuse.mismatch.mechanisms.remainders.spectrum import Remainder
 from gyrofuse.mismatch.mechanisms.slow.step import Step
-from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
+from gyrofuse.mismatch.mechanisms.spectra.slopes.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.values.rounding.quantization import Quantization
 from gyrofuse.mismatch.repair.repaired_model import RepairedModel
 from gyrofuse.mismatch.reporting.text import verdict

@@ -61,12 +61,13 @@ from gyrofuse.mismatch.mechanisms.spectra.bumps.wandering_harmonics import Wande
 from gyrofuse.mismatch.mechanisms.spectra.bumps.wandering_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
 from gyrofuse.mismatch.mechanisms.spectra.cross_talk import CrossTalk
-from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.spectra.high_pass import HighPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.moved_low_pass import MovedLowPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.notch import NotchFilter
 from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
+from gyrofuse.mismatch.mechanisms.spectra.slopes.flicker import FlickerNoise
+from gyrofuse.mismatch.mechanisms.spectra.slopes.power_law import PowerLawNoise
 from gyrofuse.mismatch.mechanisms.transients.channel_line import ChannelLine
 from gyrofuse.mismatch.mechanisms.transients.channel_tone import ChannelTone
 from gyrofuse.mismatch.mechanisms.transients.chirp import Chirp
@@ -260,6 +261,7 @@ EVERY = (
     DriftingTone(MODE, True, 0.9),
     WanderingHarmonics(MODE, True, 0.9, 2, (1, 3), (replace(MODE, centre=0.055), replace(MODE, centre=0.165))),
     FlickerNoise(numbers(1 / 3, 0.0)),
+    PowerLawNoise(numbers(1 / 3, 0.0), 4 / 3, 0.01 / 3),
     AngleQuantization(numbers(1 / 3, 0.0)),
     AngleCounts(Quantization(numbers(1.3, 0.0), numbers(0.0, 0.0), numbers(0.0, 0.0), numbers(1 / 3, 0.1))),
     CrossTalk(torch.tensor([[0.0, 1 / 3], [0.05, 0.0]], dtype=torch.float64)),

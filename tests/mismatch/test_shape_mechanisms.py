@@ -32,9 +32,9 @@ from gyrofuse.mismatch.mechanisms.spectra.bumps.oscillation import Mode
 from gyrofuse.mismatch.mechanisms.spectra.bumps.resonance import Resonance
 from gyrofuse.mismatch.mechanisms.spectra.bumps.wandering_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
-from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
+from gyrofuse.mismatch.mechanisms.spectra.slopes.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.values.unit_scale import GRAVITY, UnitScale
 from gyrofuse.mismatch.selection.held_out import score_held_out
 from gyrofuse.mismatch.signals.filters import filtered, noise

@@ -49,8 +49,9 @@ from gyrofuse.mismatch.likelihoods.spectra.fit import (
 from gyrofuse.mismatch.likelihoods.spectra.noise_parts import Parts
 from gyrofuse.mismatch.likelihoods.spectra.ratios import FLOOR, Ratios, fitness, log_gain, power_gains
 from gyrofuse.mismatch.likelihoods.spectra.starts import best_bump, best_start
-from gyrofuse.mismatch.mechanisms.spectra.joint_fit import _falls_otherwise, compared, leading_shape
+from gyrofuse.mismatch.mechanisms.spectra.joint_fit import compared, leading_shape
 from gyrofuse.mismatch.mechanisms.spectra.parameter_change import _numbers
+from gyrofuse.mismatch.mechanisms.spectra.slopes.any_slope import with_its_slope
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.filters import filtered, noise, of_phase, quadrature
 from gyrofuse.mismatch.signals.folds import in_fold
@@ -247,7 +248,9 @@ def test_derivatives_are_those_of_the_model():
         place += term.local.numel() + len(term.shared)
 
 
-def extra(term: Term) -> tuple[str, ...]:
+def extra(term: Term) -> tuple[str | float, ...]:
+    if isinstance(term, PowerLaw):
+        return (term.middle,)
     return (term.kind,) if isinstance(term, LowPass | Common) else ()
 
 
@@ -537,13 +540,14 @@ def falling(slope: float) -> Comparison:
 def test_noise_that_is_a_little_steeper_is_no_flicker(slope: float):
     data = compared(falling(slope))
     first = fit(data, [Flicker.start(data.ground)])
-    assert _falls_otherwise(data, first) == (slope != 1.0)
+    assert (with_its_slope(data, first).terms[0].name == "power_law") == (slope != 1.0)
 
 
 def test_flicker_noise_far_above_the_rest_may_be_bent_by_its_sampling():
     """Means over samples of noise whose fastest trap dwells for a quarter of one fall faster next to the rate."""
     data = compared(drawn(24, lambda x, g: x + 0.05 * noise(N, sampled_flicker, P, g)))
-    assert not _falls_otherwise(data, fit(data, [Flicker.start(data.ground)]))
+    first = fit(data, [Flicker.start(data.ground)])
+    assert with_its_slope(data, first) is first
 
 
 def sampled_flicker(f: torch.Tensor) -> torch.Tensor:
@@ -560,4 +564,5 @@ def test_noise_is_flicker_only_if_it_falls_as_flicker_does(slope: float):
     assert float(alone.sd(0)[1]) < 0.1
     assert spectrum_test(given).p_value < 1e-4
     found = nominated(given)
-    assert (found is not None and found.mechanism == "flicker") == (slope == 1.0)
+    assert found is not None
+    assert found.mechanism == ("flicker" if slope == 1.0 else "power_law")

@@ -53,12 +53,13 @@ from gyrofuse.mismatch.mechanisms.spectra.bumps.wandering_harmonics import Wande
 from gyrofuse.mismatch.mechanisms.spectra.bumps.wandering_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
 from gyrofuse.mismatch.mechanisms.spectra.cross_talk import CrossTalk
-from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.spectra.high_pass import HighPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.moved_low_pass import MovedLowPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.notch import NotchFilter
 from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
+from gyrofuse.mismatch.mechanisms.spectra.slopes.flicker import FlickerNoise
+from gyrofuse.mismatch.mechanisms.spectra.slopes.power_law import PowerLawNoise
 from gyrofuse.mismatch.mechanisms.transients.channel_tone import ChannelTone
 from gyrofuse.mismatch.mechanisms.transients.chirp import Chirp
 from gyrofuse.mismatch.mechanisms.transients.modulated_tone import ModulatedTone
@@ -123,6 +124,7 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
         Resonance,
         DriftingTone,
         FlickerNoise,
+        PowerLawNoise,
         AngleQuantization,
         CommonMode,
         CrossTalk,

@@ -126,7 +126,6 @@ _COMBINED: dict[str, tuple[str, str]] = {
 _OUTSIDE: dict[str, Callable[[Bench, float], Part]] = {
     "am_noise": _with(strange.modulated_noise, slow=True),
     "hysteresis": strange.hysteresis,
-    "power_1.5": _with(spectral.power_law, mechanism="power_1.5", exponent=1.5),
 }
 
 _UNIDENTIFIABLE: dict[str, tuple[Callable[[Bench, float], Part], dict[str, Any]]] = {
@@ -143,6 +142,7 @@ _FORMS: dict[str, Callable[[Bench, float], Part]] = {
     "harmonics": forms.harmonics,
     "laplace_noise": strange.laplace_noise,
     "periodic_noise": _with(strange.modulated_noise, slow=False),
+    "power_law": _with(spectral.power_law, mechanism="power_law", exponent=1.5),
     "bursts_of_noise": strange.bursts_of_noise,
     "modulated": forms.modulated,
     "rotor": forms.rotor,

@@ -96,7 +96,7 @@ class Term:
         return None
 
     def bent(self, ground: Ground) -> Term | None:
-        """A form that falls by any power of frequency, of which this is one; None where it is none."""
+        """Noise that falls by any power of frequency, which this may have been chosen for; None where it is not."""
         return None
 
     def only(self: _T, free: Tensor) -> _T:
@@ -217,6 +217,10 @@ class Shift(Term):
     def everywhere(self, ground: Ground) -> Term:
         return replace(self, free=Shift.start(ground).free & self.parts[:, None])
 
+    def bent(self, ground: Ground) -> PowerLaw:
+        flicker, concerned = Flicker.start(ground), self.free.any(0, keepdim=True)
+        return PowerLaw.like(replace(flicker, free=concerned, local=flicker.local * concerned), ground)
+
 
 @dataclass(frozen=True, eq=False)
 class LowPass(Term):
@@ -302,27 +306,31 @@ class Flicker(Term):
 
 @dataclass(frozen=True, eq=False)
 class PowerLaw(Term):
-    """`b (f0/f)^slope` added: the local number is `b`, shared is the slope. What flicker noise is tested against."""
+    """`b (f0/f)^slope` added: the local number is `b`, shared is the slope. What flicker noise is tested against.
+
+    Attributes:
+        middle: `f0`: where level and slope are hardly correlated, cycles per sample.
+    """
 
     name: ClassVar[str] = "power_law"
     lower: ClassVar[float] = 0.0
+    middle: float = 0.5
 
     @classmethod
     def like(cls, flicker: Flicker, ground: Ground) -> PowerLaw:
         """To start from flicker noise."""
-        return cls(flicker.local / cls._middle(ground), flicker.free, torch.ones(1, dtype=torch.float64))
-
-    @staticmethod
-    def _middle(ground: Ground) -> float:
-        """`f0`: where level and slope are hardly correlated."""
-        return math.sqrt(float(ground.nodes[0]) * 0.5)
+        middle = math.sqrt(float(ground.nodes[0]) * 0.5)
+        return cls(flicker.local / middle, flicker.free, torch.ones(1, dtype=torch.float64), middle)
 
     def values(self, ground: Ground, local: Tensor, shared: Tensor) -> Tensor:
-        falls = (self._middle(ground) / ground.nodes) ** shared[..., :1]
+        falls = (self.middle / ground.nodes) ** shared[..., :1]
         return local[..., 0, :, None] * falls[..., None, :]
 
     def within(self) -> PowerLaw:
         return replace(self, local=self.local.clamp(min=0.0), shared=self.shared.clamp(0.2, 2.0))
+
+    def rises_below(self, sd: Tensor) -> bool:
+        return True
 
 
 def oscillation(f: Tensor, centre: Tensor, width: Tensor) -> Tensor:

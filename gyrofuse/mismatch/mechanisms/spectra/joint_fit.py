@@ -27,6 +27,7 @@ from gyrofuse.mismatch.likelihoods.spectra.data import ratios, ratios_around
 from gyrofuse.mismatch.likelihoods.spectra.fit import Fit, data_model, fit, powers
 from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios, fitness, log_gain, power_gains
 from gyrofuse.mismatch.likelihoods.spectra.starts import best_bump, candidates, other_forms
+from gyrofuse.mismatch.mechanisms.spectra.slopes.any_slope import with_its_slope
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED, in_fold
@@ -152,7 +153,7 @@ def run_length(keep: Tensor) -> int:
 def leading_shape(comparison: Comparison) -> Shape | None:
     """Of the shapes that together explain the spectra the one that acts first; None where they do not.
 
-    Nor where one is flicker noise of another slope, or the first mends the form of what was found before.
+    Nor where the first mends the form of what was found before.
     """
     data = compared(comparison)
     fewest = 50.0  # complex ordinates, to search for the shape of a spectrum
@@ -160,8 +161,9 @@ def leading_shape(comparison: Comparison) -> Shape | None:
         return None
     p_seen = 1.0 if comparison.bent else shape_p_value(comparison)  # includes bands where a filter's form is off
     chosen, mended = best_terms(data, differ=p_seen < CERTAIN)
-    if chosen is None or _falls_otherwise(data, chosen):
+    if chosen is None:
         return None
+    chosen = with_its_slope(data, chosen)
     fits, explained = _explained(data, chosen)
     fits &= not mended
     if not fits and explained < _LARGELY:
@@ -287,37 +289,6 @@ def _beside_errors(comparison: Comparison, term: Term, p_seen: float) -> float:
     """Least p value of a shape beside what numbers of a fitted simulation may be off."""
     source = common_source(comparison) if term.coherent else None
     return p_seen if source is None else min(p_seen, source.p_value)
-
-
-def _falls_otherwise(data: Ratios, chosen: Fit) -> bool:
-    """Whether what flicker noise was chosen for falls by another power of frequency: that has no name.
-
-    Its slope has to gain the nats of two numbers, and to be off by more than 0.15.
-    """
-    for i, term in enumerate(chosen.terms):
-        bent = term.bent(data.ground)
-        if bent is None:
-            continue
-        terms = [*_others(chosen, i), bent]
-        found = fit(data, terms)
-        slope = float(found.terms[-1].shared)
-        if found.gain <= chosen.gain + 2 * NATS_PER_NUMBER or abs(slope - 1) <= 0.15:
-            continue
-        if not _only_bent(data, terms, slope):
-            return True
-    return False
-
-
-def _only_bent(data: Ratios, terms: list[Term], slope: float) -> bool:
-    """Whether noise of a power law, the last term, falls as `1/f` well below the rate, and not by the slope of it all.
-
-    Next to the rate any noise is bent by how it is sampled: means over samples lose some of it, and what lies above
-    half the rate is folded onto it, by less than a fifth up to a tenth of the rate. Where it is far above the rest,
-    that alone makes for another slope.
-    """
-    below = fit(data.without((data.ground.bands.frequency > 0.1)[:, None]), terms)
-    of_slow, sd = float(below.terms[-1].shared), float(below.sd(-1)[1])
-    return (slope - of_slow) ** 2 - (1 - of_slow) ** 2 > 2 * NATS_PER_NUMBER * sd**2
 
 
 def _others(chosen: Fit, i: int) -> list[Term]:

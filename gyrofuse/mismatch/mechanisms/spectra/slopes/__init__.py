@@ -1,0 +1,1 @@
+"""Noise that falls as a power of frequency."""
