@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.detectors.variance.level_spread import level_lasts
+from gyrofuse.mismatch.detectors.variance.random_levels import is_random_level
 from gyrofuse.mismatch.likelihoods.laws.heavy_tails import HeavyTails
 from gyrofuse.mismatch.likelihoods.laws.outlier_law import clustered
 from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
@@ -50,6 +51,8 @@ class HeavyTailedNoise(InnovationsLaw):
         present = 15.0  # nats over normal noise, and over what the simulation has
         heavy = tuple((gains > present).nonzero()[:, 0].tolist())
         if not heavy or clustered(z[list(heavy)]) or any(level_lasts(z[i]) for i in heavy):
+            return None
+        if is_random_level(comparison, float(gains[list(heavy)].sum())):
             return None
         info, parameters = comparison.info, {}
         for i in heavy:

@@ -14,6 +14,7 @@ from gyrofuse.mismatch.detectors.variance.haar_kurtosis import jump_test
 from gyrofuse.mismatch.detectors.variance.level_spread import level_lasts
 from gyrofuse.mismatch.detectors.variance.normality import gaussian_sensors
 from gyrofuse.mismatch.detectors.variance.outliers import spike_p_value
+from gyrofuse.mismatch.detectors.variance.random_levels import is_random_level
 from gyrofuse.mismatch.likelihoods.laws.heavy_tails import heavy_tailed
 from gyrofuse.mismatch.likelihoods.laws.two_levels import TwoLevels
 from gyrofuse.mismatch.mechanisms import pictures
@@ -82,7 +83,8 @@ class ScaleMixture(InnovationsLaw):
             for i, (law, gain) in enumerate(zip(laws, gains, strict=True))
             if gain > present and rare < law.share < 1 - rare and gain > heavy_tailed(z[i][law.within(z[i])]) + better
         )
-        if not hit or any(level_lasts(z[i]) for i in hit):
+        gain = sum(gains[i] for i in hit)
+        if not hit or any(level_lasts(z[i]) for i in hit) or is_random_level(comparison, gain):
             return None
         info, parameters = comparison.info, {}
         share, ratio = torch.zeros(2, comparison.n_sensors, dtype=torch.float64)
@@ -105,7 +107,7 @@ class ScaleMixture(InnovationsLaw):
             hit,
             parameters,
             levels=(1,),
-            gain=sum(gains[i] for i in hit),
+            gain=gain,
         )
 
     def fit_without(self, comparison: Comparison, fold: int) -> ScaleMixture:
