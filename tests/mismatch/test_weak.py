@@ -283,7 +283,7 @@ def test_limits_of_a_band_follow_from_the_nearest_value_left() -> None:
     assert band is not None
     assert (band.half_width, band.low, band.high) == pytest.approx((middle, low, high))
     assert not band.subtracts
-    assert band_of(own._replace(times=40), values, float(values.std())) is None
+    assert band_of(own._replace(times=40, samples=40), values, float(values.std())) is None
 
 
 # Hidden lattices.
