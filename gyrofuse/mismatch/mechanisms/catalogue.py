@@ -104,12 +104,8 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (WanderingHarmonics,),  # each of whose lines alone looks like several tones, or like noise that changes
     (VibrationTone, ModulatedTone, ToneInSpells, ToneSize, Interleaving),
     (RandomTelegraph,),
-    (
-        ChannelNoise,
-        PeriodicNoise,
-        GradualChange,
-        RandomLevelNoise,
-    ),  # where noise is louder, what is slow is known less well
+    # Where noise is louder, what is slow is known less well.
+    (ChannelNoise, PeriodicNoise, GradualChange, RandomLevelNoise),
     (TemperatureDrift, WarmUpTransient, LateWarmUp, Ramp, Step, BiasOscillation),
     (SimulatedWarmUp, SimulatedRamp, SimulatedStep),
     (VarianceChange,),  # to which large jumps look alike

@@ -185,9 +185,7 @@ def _without_end_spikes(stairs: np.ndarray, information: float) -> np.ndarray:
     return stairs
 
 
-def fitted_levels(
-    squares: Tensor, share: Tensor, concerned: Tensor, steady: Tensor | None = None
-) -> tuple[Tensor, Tensor, Tensor]:
+def fitted_levels(squares: Tensor, share: Tensor, concerned: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Log variances where a course is 0, their change to where it is 1, and sds of the change, `(sensor,)` each.
 
     Fisher scoring; a sample has the information one half of a log variance.
@@ -196,10 +194,7 @@ def fitted_levels(
         squares: Squares of whitened samples, `(sensor, time)`.
         share: Course, `(time,)`.
         concerned: Sensors that change, `(sensor,)`.
-        steady: Variance that they have besides, all the time, `(sensor,)`; none by default.
     """
-    if steady is not None:
-        return _above_steady(squares, share, concerned, steady)
     design = torch.stack([torch.ones_like(share), share])
     inverse = torch.linalg.inv(design @ design.mT / 2)
     base = (squares.median(-1).values / CHI2_MEDIAN).clamp(min=1e-300).log()
@@ -212,8 +207,11 @@ def fitted_levels(
     return base, change, inverse[1, 1].sqrt().expand(len(squares))
 
 
-def _above_steady(squares: Tensor, share: Tensor, concerned: Tensor, steady: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The same of variances `steady + exp(base + change c)`, beginning without what is steady."""
+def levels_above(squares: Tensor, share: Tensor, concerned: Tensor, steady: Tensor) -> tuple[Tensor, Tensor]:
+    """Log variances above one that is `steady` `(sensor,)` where a course is 0, and their change; as `fitted_levels`.
+
+    Of variances `steady + exp(base + change c)`, beginning without what is steady.
+    """
     base, change, _ = fitted_levels(squares, share, concerned)
     ends = torch.stack([base, base + change]).exp()
     low, high = (ends - steady).maximum(0.1 * ends).log()
@@ -226,7 +224,7 @@ def _above_steady(squares: Tensor, share: Tensor, concerned: Tensor, steady: Ten
         information = torch.einsum("at,bt,st->sab", c, c, (own / variance).square()) / 2
         steps = torch.linalg.solve(information, score).clamp(-_STEEPEST, _STEEPEST)
         base, change = base + steps[:, 0], torch.where(concerned, change + steps[:, 1], 0.0)
-    return base, change, torch.linalg.inv(information)[:, 1, 1].sqrt()
+    return base, change
 
 
 def _n_blocks(n: int) -> int:

@@ -47,7 +47,7 @@ def level_laws(comparison: Comparison) -> LevelLaws:
     Plainly likelier than heavy tails of each sample by itself, and than the law of the simulation.
     """
     squares, present, lasts, often = level_squares(comparison), 15.0, 2.0, 6.0  # nats, samples, times
-    white, own = _flat(whitened_recording(comparison)), dict[int, RandomLevel]()
+    white, own = _flat_recording(comparison), dict[int, RandomLevel]()
     for i, rows in enumerate(squares):
         law = RandomLevel.fitted(rows)
         turns = min(law.share, 1 - law.share) * rows.numel() * law.leave
@@ -75,7 +75,12 @@ def _simulated_gain(comparison: Comparison, sensor: int, squares: Tensor) -> flo
 @derived
 def level_squares(comparison: Comparison) -> Tensor:
     """Squares of the whitened recording in blocks, their means one, `(sensor, block, time)`."""
-    return _in_blocks(_flat(whitened_recording(comparison)))
+    return _in_blocks(_flat_recording(comparison))
+
+
+@derived
+def _flat_recording(comparison: Comparison) -> Tensor:
+    return _flat(whitened_recording(comparison))
 
 
 def _in_blocks(values: Tensor) -> Tensor:

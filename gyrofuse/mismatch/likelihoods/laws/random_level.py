@@ -12,12 +12,14 @@ References:
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
 from scipy import optimize, special, stats
 from torch import Tensor
+
+_Number = TypeVar("_Number", float, Tensor)
 
 
 class RandomLevel(NamedTuple):
@@ -41,7 +43,7 @@ class RandomLevel(NamedTuple):
     @property
     def mean(self) -> float:
         """Mean of the variance."""
-        return self.base * (1 + self.share * (self.factor ** (1 / self.sources) - 1)) ** self.sources
+        return self.base * mean_over_base(self.sources, self.factor, self.share)
 
     @property
     def share(self) -> float:
@@ -118,6 +120,11 @@ class RandomLevel(NamedTuple):
             },
         )
         return law(run.x)
+
+
+def mean_over_base(sources: _Number, factor: _Number, share: _Number) -> _Number:
+    """Mean of the variance over that where no source is on, of numbers or of tensors of them."""
+    return (1 + share * (factor ** (1 / sources) - 1)) ** sources
 
 
 def chain(sources: int, enter: float, leave: float) -> tuple[Tensor, Tensor]:

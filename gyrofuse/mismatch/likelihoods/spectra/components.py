@@ -314,7 +314,7 @@ class PowerLaw(Term):
 
     name: ClassVar[str] = "power_law"
     lower: ClassVar[float] = 0.0
-    middle: float = 0.5
+    middle: float
 
     @classmethod
     def like(cls, flicker: Flicker, ground: Ground) -> PowerLaw:

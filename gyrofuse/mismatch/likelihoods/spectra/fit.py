@@ -47,6 +47,10 @@ class Fit(NamedTuple):
         """Model of the ratios of powers, `(band, sensor)`."""
         return powers(self.model)
 
+    def others(self, term: int) -> list[Term]:
+        """All terms but one."""
+        return [*self.terms[:term], *self.terms[term + 1 :]]
+
     def sd(self, term: int) -> tuple[Tensor, Tensor]:
         """Standard deviations of a term's local `(number, sensor)` and shared numbers; NaN where not free."""
         rows, own = self.rows[term], self.terms[term]

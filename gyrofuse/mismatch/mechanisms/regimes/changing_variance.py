@@ -15,6 +15,7 @@ from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.folds import estimation_samples, held_out_blocks
+from gyrofuse.mismatch.signals.records import Records
 from gyrofuse.mismatch.signals.variance_course import (
     VarianceCourse,
     fast_factor,
@@ -24,7 +25,7 @@ from gyrofuse.mismatch.signals.variance_course import (
 )
 from gyrofuse.mismatch.stats.limits import Z
 from gyrofuse.mismatch.stats.segments import course_scores
-from gyrofuse.mismatch.stats.variance_courses import Course, fitted_levels
+from gyrofuse.mismatch.stats.variance_courses import Course, fitted_levels, levels_above
 
 MOSTLY = 0.5  # of the way of a course
 
@@ -126,7 +127,7 @@ def fast_levels(white: Tensor, share: Tensor, concerned: Tensor, corner: float) 
     """
     squares, fast = white.square(), mean_fast_share(corner)
     mean = squares.mean(-1)
-    base, change, _ = fitted_levels(squares, share, concerned, (1 - fast) * mean)
+    base, change = levels_above(squares, share, concerned, (1 - fast) * mean)
     return base - (fast * mean).log(), change
 
 
@@ -151,11 +152,17 @@ def over_the_simulation(comparison: Comparison, known: VarianceCourse) -> Tensor
     """Variance of the fast noise where a course is 0, over that of the simulation if it has a level of its own."""
     if compared_levels(comparison) is None:
         return torch.as_tensor(known.base)
-    observed, reference = replace(comparison.observed, loud=(*comparison.observed.loud, known)), comparison.reference
-    fast = fast_share(comparison.bands.frequency, known.corner)
-    weight = observed.dof * reference.dof / (observed.dof + reference.dof).clamp(min=1e-300) * fast
-    over = ((observed.power / reference.power.clamp(min=1e-300)).clamp(min=1e-300).log() @ weight / weight.sum()).exp()
+    observed = replace(comparison.observed, loud=(*comparison.observed.loud, known))
+    over = fast_power_over(observed, comparison.reference, known.corner)
     return torch.where(known.factor != 1, known.base * over, 1.0)
+
+
+def fast_power_over(observed: Records, reference: Records, corner: float) -> Tensor:
+    """Power of the fast noise over that of other records, a mean over bands of the logarithm, `(sensor,)`."""
+    fast = fast_share(observed.bands.frequency, corner)
+    weight = observed.dof * reference.dof / (observed.dof + reference.dof).clamp(min=1e-300) * fast
+    log_ratio = (observed.power / reference.power.clamp(min=1e-300)).clamp(min=1e-300).log()
+    return (log_ratio @ weight / weight.sum()).exp()
 
 
 def level_along(white: Tensor, share: Tensor) -> Course | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
@@ -96,20 +96,18 @@ class ChannelNoise(LevelCourse):
         if not changing:
             return None
         _, name, row, kind, values = max(changing, key=lambda one: one[0])
-        low_to_high = _ends(values)
+        ways = [(ends, bend) for ends in (_ends(values), _ends(values).flip(0)) for bend in bends]
         bent = [
-            (course_score(white, course, weight), ends, bend, course)
-            for ends in (low_to_high, low_to_high.flip(0))
-            for bend in bends
+            (course_score(white, course, weight), course)
+            for ends, bend in ways
             if (course := level_along(white, _share(values, ends, bend))) is not None
         ]
-        score, ends, bend, course = max(bent, key=lambda one: one[0])
+        score, course = max(bent, key=lambda one: one[0])
         score -= math.log(len(tried) * len(bends))
         if score < score_of_episodes(comparison) + NATS_AS_GOOD or _still_goes_up_and_down(comparison, course):
             return None
-        known, bend, ends = _along(
-            white, weight, of_the_fast_noise(comparison, course, course.share > MOSTLY), values, bends
-        )
+        known = of_the_fast_noise(comparison, course, course.share > MOSTLY)
+        known, (ends, bend) = _along(white, weight, known, values, ways)
         base = over_the_simulation(comparison, known)
         effect = cls(name, row, kind, ends, bend, base, known.factor, known.corner * info.rate, lines_of(comparison))
         sensors = tuple((known.factor != 1).nonzero()[:, 0].tolist())
@@ -173,23 +171,21 @@ def _share(values: Tensor, ends: Tensor, bend: float) -> Tensor:
 
 
 def _along(
-    white: Tensor, weight: Tensor, known: VarianceCourse, values: Tensor, bends: tuple[float, ...]
-) -> tuple[VarianceCourse, float, Tensor]:
-    """The course along a channel's values `(time,)` of the fast noise alone, with its bend and its ends.
+    white: Tensor, weight: Tensor, known: VarianceCourse, values: Tensor, ways: Sequence[tuple[Tensor, float]]
+) -> tuple[VarianceCourse, tuple[Tensor, float]]:
+    """The course along a channel's values `(time,)` of the fast noise alone, with the likeliest of its ends and bends.
 
     What whitened samples have of the slow noise bends a straight course where the fast one is quiet.
     """
-    concerned, found = known.factor != 1, list[tuple[float, VarianceCourse, float, Tensor]]()
+    concerned, found = known.factor != 1, list[tuple[float, VarianceCourse, tuple[Tensor, float]]]()
     mean = white.square().mean(-1, keepdim=True)
-    for ends in (_ends(values), _ends(values).flip(0)):
-        for bend in bends:
-            share = _share(values, ends, bend)
-            base, log_factor = fast_levels(white, share, concerned, known.corner)
-            one = replace(known, course=share, factor=log_factor.exp(), base=torch.where(concerned, base.exp(), 1.0))
-            score = float(weight[concerned] @ course_scores(white, mean * one.variance).sum(-1)[concerned])
-            found.append((score, one, bend, ends))
-    _, one, bend, ends = max(found, key=lambda entry: entry[0])
-    return one, bend, ends
+    for way in ways:
+        share = _share(values, *way)
+        base, log_factor = fast_levels(white, share, concerned, known.corner)
+        one = replace(known, course=share, factor=log_factor.exp(), base=torch.where(concerned, base.exp(), 1.0))
+        score = float(weight[concerned] @ course_scores(white, mean * one.variance).sum(-1)[concerned])
+        found.append((score, one, way))
+    return max(found, key=lambda entry: entry[0])[1:]
 
 
 def score_of_episodes(comparison: Comparison) -> float:

@@ -10,23 +10,19 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.decisions import NATS_AS_GOOD
-from gyrofuse.mismatch.detectors.variance.noise_level import (
-    compared_levels,
-    modulation,
-    variance_p_value,
-)
+from gyrofuse.mismatch.detectors.variance.noise_level import compared_levels, modulation, variance_p_value
 from gyrofuse.mismatch.detectors.variance.random_levels import LevelLaws, level_laws, level_squares
-from gyrofuse.mismatch.likelihoods.laws.random_level import RandomLevel
+from gyrofuse.mismatch.likelihoods.laws.random_level import RandomLevel, mean_over_base
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.finding_parts import Parameter
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
-from gyrofuse.mismatch.mechanisms.regimes.changing_variance import lines_of
+from gyrofuse.mismatch.mechanisms.regimes.changing_variance import fast_power_over, lines_of
 from gyrofuse.mismatch.mechanisms.regimes.channel_noise import score_of_episodes
 from gyrofuse.mismatch.mechanisms.values.stuck_samples import taken_rows
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import N_JUDGED, in_fold
-from gyrofuse.mismatch.signals.variance_course import CORNER, VarianceCourse, fast_share
+from gyrofuse.mismatch.signals.variance_course import CORNER, VarianceCourse
 from gyrofuse.mismatch.stats.limits import Z
 from gyrofuse.mismatch.stats.multiplicity import sidak
 
@@ -160,8 +156,8 @@ class RandomLevelNoise(Mechanism):
 
     def apply_to_reference(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
         """With the mean level of the recording: bursts are few, and what comes of them by chance is no other noise."""
-        rate, sources = comparison.info.rate, torch.tensor(self.sources).clamp(min=1)
-        expected = (1 + self.share * (self.factor ** (1 / sources) - 1)) ** sources
+        rate = comparison.info.rate
+        expected = mean_over_base(torch.tensor(self.sources).clamp(min=1), self.factor, self.share)
 
         def louder(signal: Tensor) -> Tensor:
             course = self._drawn(signal, rate, generator)
@@ -179,8 +175,4 @@ def _over_the_simulation(comparison: Comparison) -> Tensor:
     """Mean variance of the fast noise over the simulation's, `(sensor,)`, where that has a level of its own."""
     if compared_levels(comparison) is None:
         return torch.ones(comparison.n_sensors, dtype=torch.float64)
-    observed, reference = comparison.observed, comparison.reference
-    fast = fast_share(comparison.bands.frequency, CORNER)
-    weight = observed.dof * reference.dof / (observed.dof + reference.dof).clamp(min=1e-300) * fast
-    log_ratio = (observed.power / reference.power.clamp(min=1e-300)).clamp(min=1e-300).log()
-    return (log_ratio @ weight / weight.sum()).exp()
+    return fast_power_over(comparison.observed, comparison.reference, CORNER)

@@ -175,7 +175,7 @@ def leading_shape(comparison: Comparison) -> Shape | None:
     first, gain, alone = _first(data, chosen, [term for term, _ in seen], found, comparison.passed_over)
     if found[first] or chosen.terms[first].name in comparison.passed_over:
         return None
-    term, others = chosen.terms[first], _others(chosen, first)
+    term, others = chosen.terms[first], chosen.others(first)
     n_classes = 16.0  # classes and frequencies that compete
     p = sidak(float(stats.chi2.sf(2 * gain, term.n_free(data.ground))), n_classes)
     if not others and gain >= e_value_of(p_seen):  # all that the scan of shapes saw: a mean is not above the best
@@ -248,7 +248,7 @@ def _first(
     """
     losses, next_to_nothing = [chosen.gain], 0.01
     if len(terms) > 1:
-        losses = [chosen.gain - max(fit(data, _others(chosen, i)).gain, 0.0) for i in range(len(terms))]
+        losses = [chosen.gain - max(fit(data, chosen.others(i)).gain, 0.0) for i in range(len(terms))]
     most = max(range(len(terms)), key=lambda i: losses[i])
 
     def rank(i: int) -> tuple[bool, bool, bool, int, float]:
@@ -268,7 +268,7 @@ def _rivals(
     comparison: Comparison, data: Ratios, chosen: Fit, first: int, sd: tuple[Tensor, Tensor]
 ) -> tuple[str, ...]:
     """Mechanisms that explain as much as the first term, by name."""
-    term, others = chosen.terms[first], _others(chosen, first)
+    term, others = chosen.terms[first], chosen.others(first)
     rivals = {
         rival.name
         for rival in candidates(data, others)
@@ -291,15 +291,11 @@ def _beside_errors(comparison: Comparison, term: Term, p_seen: float) -> float:
     return p_seen if source is None else min(p_seen, source.p_value)
 
 
-def _others(chosen: Fit, i: int) -> list[Term]:
-    return [t for j, t in enumerate(chosen.terms) if j != i]
-
-
 def _with_sd(comparison: Comparison, chosen: Fit, i: int) -> tuple[Term, tuple[Tensor, Tensor]]:
     """A shape and standard deviations of its numbers; of sharp peaks by narrower bands."""
     term = chosen.terms[i]
     if isinstance(term, Peak | CommonBump) and float(term.shared.diff()) < math.log(_SHARP):
-        closer = _closer(comparison, term, _others(chosen, i))
+        closer = _closer(comparison, term, chosen.others(i))
         if bool(closer[1][1].isfinite().all()):  # else there are too few bands next to zero
             return closer
     return term, chosen.sd(i)

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.decisions import NATS_PER_NUMBER
+from gyrofuse.mismatch.detectors.lines.interleaving import alternation
 from gyrofuse.mismatch.detectors.values.bends import bends
 from gyrofuse.mismatch.detectors.values.lattices import distinct_values
 from gyrofuse.mismatch.detectors.values.values import end_stops
@@ -61,10 +62,13 @@ class Nonlinearity(Mechanism):
         if float(p_values.min()) > level:
             return None
         first, others = 10.0, 2 * NATS_PER_NUMBER  # nats over its rivals, of a sensor by itself and beside one
+        plain = 6.0  # standard deviations
         at_ends = {end.sensor for end in end_stops(comparison) if end.p_value <= level}
+        # Two laws in turns are no normal one, though nothing is bent.
+        alternates = alternation(comparison).square > plain**2
         bent = dict[int, _Bend]()
         for i in included_sensors(scores.square().sum(-1), 2).positions:
-            if i not in at_ends and _has_a_density(comparison, i) and not _alternates(comparison, i):
+            if i not in at_ends and _has_a_density(comparison, i) and not alternates[i]:
                 bend = _Bend.of(comparison.recording[i], comparison.base, i)
                 if bend.explains(comparison, first if float(p_values[i]) <= level else others):
                     bent[i] = bend
@@ -255,12 +259,6 @@ class _Bend(NamedTuple):
         """Those of noise as large as was felt."""
         felt = curve.at(self.noise.y)
         return curve.coefficients(float(felt.mean()), float(felt.std()))
-
-
-def _alternates(comparison: Comparison, sensor: int) -> bool:
-    """Whether every second sample is off: two laws in turns are no normal one, though nothing is bent."""
-    plain, white = 6.0, comparison.white[sensor]  # standard deviations
-    return abs(float(white[::2].sum() - white[1::2].sum())) > plain * math.sqrt(len(white))
 
 
 def _has_a_density(comparison: Comparison, sensor: int) -> bool:

@@ -16,15 +16,15 @@ def with_its_slope(data: Ratios, chosen: Fit) -> Fit:
     """
     flicker, walk = (0.85, 1.15), 1.8  # slopes
     for i, term in enumerate(chosen.terms):
-        others = [other for j, other in enumerate(chosen.terms) if j != i]
         bent = term.bent(data.ground)
         if bent is None:
             continue
-        found = fit(data, [*others, bent])
+        terms = [*chosen.others(i), bent]
+        found = fit(data, terms)
         slope = float(found.terms[-1].shared)
         if found.gain <= chosen.gain + 2 * NATS_PER_NUMBER or flicker[0] < slope < flicker[1] or slope > walk:
             continue
-        if not _only_bent(data, [*others, bent], slope):
+        if not _only_bent(data, terms, slope):
             return _without_idle(data, found)
     return chosen
 

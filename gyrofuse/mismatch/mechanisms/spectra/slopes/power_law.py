@@ -27,7 +27,7 @@ from gyrofuse.mismatch.stats.limits import Z
 class PowerLawNoise(Addition):
     """`S_i -> S_i + b_i (f0/f)^slope`: fractional noise, of any slope but that of flicker noise.
 
-    Looked for where flicker noise would be named, and another slope is plainly likelier.
+    Looked for where flicker noise, or other numbers of the simulation, would be named and it is plainly likelier.
 
     Attributes:
         level: `b`, `(sensor,)`, the density per sample at `f0`, unit of the signal squared.
